@@ -1,1 +1,3 @@
-//! tests
+//! What the tests share: golden data and scratch clips.
+
+pub mod golden;

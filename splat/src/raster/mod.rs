@@ -1,1 +1,41 @@
-//! placeholder
+//! The CPU engine: differentiable rasterization of 3D Gaussians in rows of exact ellipse spans.
+//!
+//! One file per stage, each named as the stage: [`project`] → [`bin`] → [`blend`] → [`blend_backward`] →
+//! [`project_backward`]; [`footprint_moments`] shares the first three. The equations are those of 3D Gaussian
+//! Splatting (Kerbl et al. 2023, section 4 and 6) over EWA splatting (Zwicker et al. 2001).
+//!
+//! An image is cut into bands of [`bin::BAND_ROWS`] rows whatever the number of threads; every sum over bands is
+//! taken in band order. So the result has the same bytes on one thread and on many.
+
+pub mod bin;
+pub mod blend;
+pub mod blend_backward;
+mod colour;
+mod engine;
+pub mod footprint_moments;
+mod lanes;
+pub mod project;
+pub mod project_backward;
+mod session;
+#[cfg(test)]
+mod tests;
+
+pub use engine::{CpuEngine, render, render_backward};
+
+/// Points nearer than this to the principal plane are not drawn, in world units.
+pub const NEAR_PLANE: f64 = 0.01;
+
+/// Added to the diagonal of every projected covariance, pixels²: no footprint is smaller than a pixel.
+pub const LOW_PASS: f64 = 0.3;
+
+/// A pixel on which a Gaussian has less opacity than this does not see it.
+pub const ALPHA_MIN: f32 = 1.0 / 255.0;
+
+/// Opacity of one Gaussian on one pixel is clamped here, so that the replay can divide by `1 - alpha`.
+pub const ALPHA_MAX: f32 = 0.99;
+
+/// Blending stops before the Gaussian that would bring the transmittance below this.
+pub const TRANSMITTANCE_MIN: f32 = 1e-4;
+
+/// The slope of the local affine projection is held at the image border plus this share of the half field of view.
+pub const FRUSTUM_MARGIN: f64 = 0.3;
