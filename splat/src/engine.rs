@@ -87,8 +87,6 @@ pub struct DensityStatistics {
     pub gradient_norm: Vec<f32>,
     /// Number of steps in which the Gaussian was visible.
     pub visible_steps: Vec<u32>,
-    /// Largest blending weight `alpha * T` that a pixel gave the Gaussian.
-    pub max_weight: Vec<f32>,
 }
 
 /// Parameters, optimiser state and images kept on a device between steps.

@@ -3,7 +3,7 @@
 use super::{
     ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
     bin::{BAND_ROWS, Bins},
-    lanes::{LANES, exp2, group_mut, multiply_add, simd_kernel},
+    lanes::{LANES, Simd, group_mut, simd_kernel},
     project::Footprint,
 };
 
@@ -22,8 +22,9 @@ pub struct Band {
     pub transmittance: Vec<f32>,
     /// Red, green and blue blended so far.
     pub colour: [Vec<f32>; 3],
-    /// 1 + position in the band's entries of the last footprint that the pixel blended; 0: none.
-    pub last: Vec<u32>,
+    /// 1 + position in the band's entries of the last footprint that the pixel blended; 0: none. Single precision
+    /// counts exactly to 2²⁴, more entries than a band can hold in memory.
+    pub last: Vec<f32>,
 }
 
 impl Band {
@@ -45,7 +46,7 @@ impl Band {
             plane.resize(size, 0.0);
         }
         self.last.clear();
-        self.last.resize(size, 0);
+        self.last.resize(size, 0.0);
     }
 }
 
@@ -64,6 +65,15 @@ pub(super) struct Span {
     pub peak: f32,
     /// Half the inverse variance along the row, in units of base-2 exponents.
     pub curvature: f32,
+}
+
+impl Span {
+    /// Alpha before the clamp of the group whose first column lies `offset` from the row centre.
+    #[inline(always)]
+    pub(super) fn alpha<S: Simd>(&self, offset: f32) -> S {
+        let d = S::ramp().add(S::splat(offset));
+        d.mul(d).mul_add(S::splat(-self.curvature), S::splat(self.peak)).exp2()
+    }
 }
 
 /// The columns of image row `row` on which the footprint's alpha can reach [`ALPHA_MIN`].
@@ -88,7 +98,7 @@ pub(super) fn span(footprint: &Footprint, row: usize, width: usize) -> Option<Sp
         end: high as usize + 1,
         offset: (low + 0.5 - centre) as f32,
         dy: dy as f32,
-        peak: (footprint.opacity.log2() - fall * std::f64::consts::LOG2_E) as f32,
+        peak: ((footprint.log_opacity - fall) * std::f64::consts::LOG2_E) as f32,
         curvature: (0.5 * footprint.inverse_conditional * std::f64::consts::LOG2_E) as f32,
     })
 }
@@ -109,7 +119,7 @@ simd_kernel! {
 }
 
 #[inline(always)]
-fn blend_kernel<const FUSED: bool>(bins: &Bins, number: usize, band: &mut Band) {
+fn blend_kernel<S: Simd>(bins: &Bins, number: usize, band: &mut Band) {
     for (place, &position) in bins.band(number).iter().enumerate() {
         let footprint = &bins.footprints[position as usize];
         for row in rows(footprint, band.first_row, band.rows) {
@@ -118,13 +128,13 @@ fn blend_kernel<const FUSED: bool>(bins: &Bins, number: usize, band: &mut Band) 
             let mut offset = span.offset;
             let mut first = span.first;
             while first < span.end {
-                blend_group::<FUSED>(
+                blend_group::<S>(
                     band,
                     row_start + first,
                     offset,
                     &span,
                     footprint.colour,
-                    place as u32 + 1,
+                    (place + 1) as f32,
                 );
                 first += LANES;
                 offset += LANES as f32;
@@ -134,38 +144,32 @@ fn blend_kernel<const FUSED: bool>(bins: &Bins, number: usize, band: &mut Band) 
 }
 
 #[inline(always)]
-fn blend_group<const FUSED: bool>(
+fn blend_group<S: Simd>(
     band: &mut Band,
     first: usize,
     offset: f32,
     span: &Span,
     colour: [f32; 3],
-    mark: u32,
+    mark: f32,
 ) {
     let transmittance = group_mut(&mut band.transmittance, first);
-    let mut weights = [0.0f32; LANES];
-    for lane in 0..LANES {
-        let d = offset + lane as f32;
-        let alpha = exp2::<FUSED>(multiply_add::<FUSED>(-span.curvature * d, d, span.peak));
-        let alpha = if alpha < ALPHA_MAX { alpha } else { ALPHA_MAX };
-        let before = transmittance[lane];
-        let after = before - before * alpha;
-        let hit = (alpha >= ALPHA_MIN) & (before > 0.0);
-        let stops = hit & (after < TRANSMITTANCE_MIN);
-        let blends = hit & !stops;
-        weights[lane] = if blends { before * alpha } else { 0.0 };
-        let kept = if stops { -before } else { before };
-        transmittance[lane] = if blends { after } else { kept };
+    let before = S::load(transmittance);
+    let alpha = span.alpha::<S>(offset).min(S::splat(ALPHA_MAX));
+    let zero = S::splat(0.0);
+    let hit = S::both(alpha.ge(S::splat(ALPHA_MIN)), zero.lt(before));
+    if !S::any(hit) {
+        return;
     }
-    let [red, green, blue] = &mut band.colour;
-    for (plane, value) in [red, green, blue].into_iter().zip(colour) {
+    let weight = before.mul(alpha);
+    let after = before.sub(weight);
+    let blends = S::both(hit, after.ge(S::splat(TRANSMITTANCE_MIN)));
+    let stopped = S::select(hit, zero.sub(before), before);
+    S::select(blends, after, stopped).store(transmittance);
+    let weight = S::select(blends, weight, zero);
+    for (plane, value) in band.colour.iter_mut().zip(colour) {
         let plane = group_mut(plane, first);
-        for lane in 0..LANES {
-            plane[lane] = multiply_add::<FUSED>(weights[lane], value, plane[lane]);
-        }
+        weight.mul_add(S::splat(value), S::load(plane)).store(plane);
     }
     let last = group_mut(&mut band.last, first);
-    for lane in 0..LANES {
-        last[lane] = if weights[lane] > 0.0 { mark } else { last[lane] };
-    }
+    S::select(blends, S::splat(mark), S::load(last)).store(last);
 }

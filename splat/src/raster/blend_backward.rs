@@ -9,7 +9,7 @@ use super::{
     ALPHA_MAX, ALPHA_MIN,
     bin::Bins,
     blend::{Band, Span, rows, span},
-    lanes::{LANES, exp2, group, group_mut, multiply_add, simd_kernel, sum},
+    lanes::{LANES, Simd, group, group_mut, simd_kernel},
 };
 
 /// Gradient of the loss by one footprint, from one band or summed over bands.
@@ -105,7 +105,7 @@ simd_kernel! {
 }
 
 #[inline(always)]
-fn backward_kernel<const FUSED: bool>(
+fn backward_kernel<S: Simd>(
     bins: &Bins,
     number: usize,
     band: &Band,
@@ -116,123 +116,145 @@ fn backward_kernel<const FUSED: bool>(
     for (place, &position) in bins.band(number).iter().enumerate().rev() {
         let footprint = &bins.footprints[position as usize];
         let is_active = active.get(footprint.index as usize).copied().unwrap_or(true);
-        let mut sums = Sums::default();
+        let place_mark = S::splat(place as f32);
+        let mut sums = Sums::<S>::zero();
         for row in rows(footprint, band.first_row, band.rows) {
             let Some(span) = span(footprint, row, band.width) else { continue };
             let row_start = (row - band.first_row) * band.stride;
-            let mut row_sums = RowSums::default();
+            let mut row_sums = RowSums::<S>::zero();
             let mut offset = span.offset;
-            let mut first = span.first;
-            while first < span.end {
-                let group_start = row_start + first;
-                backward_group::<FUSED>(
-                    &band.last,
-                    replay,
-                    group_start,
-                    offset,
-                    &span,
-                    footprint.colour,
-                    place as u32,
-                    &mut row_sums,
-                    &mut sums.colour,
-                );
+            let mut first = row_start + span.first;
+            while first < row_start + span.end {
+                let undone =
+                    undo::<S>(&band.last, replay, first, offset, &span, footprint.colour, place_mark);
+                if let Some(undone) = undone
+                    && is_active
+                {
+                    row_sums.add(&undone, offset);
+                    sums.add_colour(&undone, &replay.gradient, first);
+                }
                 first += LANES;
                 offset += LANES as f32;
             }
-            sums.add_row::<FUSED>(&row_sums, span.dy);
+            sums.add_row(&row_sums, span.dy);
         }
         gradients[place] = if is_active { sums.reduce() } else { FootprintGradient::default() };
     }
 }
 
-#[derive(Default)]
-struct RowSums {
-    v: [f32; LANES],
-    v_d: [f32; LANES],
-    v_dd: [f32; LANES],
+/// What one footprint did to a group of pixels.
+struct Undone<S> {
+    weight: S,
+    /// `alpha · ∂loss/∂alpha`, zero where alpha was clamped.
+    v: S,
 }
 
-#[derive(Default)]
-struct Sums {
-    row: RowSums,
-    v_y: [f32; LANES],
-    v_dy: [f32; LANES],
-    v_yy: [f32; LANES],
-    colour: [[f32; LANES]; 3],
-}
-
-impl Sums {
-    #[inline(always)]
-    fn add_row<const FUSED: bool>(&mut self, row: &RowSums, dy: f32) {
-        for lane in 0..LANES {
-            let v_y = row.v[lane] * dy;
-            self.row.v[lane] += row.v[lane];
-            self.row.v_d[lane] += row.v_d[lane];
-            self.row.v_dd[lane] += row.v_dd[lane];
-            self.v_y[lane] += v_y;
-            self.v_dy[lane] = multiply_add::<FUSED>(row.v_d[lane], dy, self.v_dy[lane]);
-            self.v_yy[lane] = multiply_add::<FUSED>(v_y, dy, self.v_yy[lane]);
-        }
-    }
-
-    #[inline(always)]
-    fn reduce(&self) -> FootprintGradient {
-        FootprintGradient {
-            v: sum(&self.row.v).into(),
-            v_d: sum(&self.row.v_d).into(),
-            v_dd: sum(&self.row.v_dd).into(),
-            v_y: sum(&self.v_y).into(),
-            v_dy: sum(&self.v_dy).into(),
-            v_yy: sum(&self.v_yy).into(),
-            colour: [sum(&self.colour[0]).into(), sum(&self.colour[1]).into(), sum(&self.colour[2]).into()],
-        }
-    }
-}
-
+/// Takes a footprint's light out of a group of pixels; `None` if none of them blended it.
 #[inline(always)]
-fn backward_group<const FUSED: bool>(
-    last: &[u32],
+fn undo<S: Simd>(
+    last: &[f32],
     replay: &mut Replay,
     first: usize,
     offset: f32,
     span: &Span,
     colour: [f32; 3],
-    place: u32,
-    row: &mut RowSums,
-    colour_sums: &mut [[f32; LANES]; 3],
-) {
-    let last = group(last, first);
-    let [red, green, blue] = &replay.gradient;
-    let (red, green, blue) = (group(red, first), group(green, first), group(blue, first));
+    place: S,
+) -> Option<Undone<S>> {
+    let unclamped = span.alpha::<S>(offset);
+    let largest = S::splat(ALPHA_MAX);
+    let alpha = unclamped.min(largest);
+    let blended = S::both(alpha.ge(S::splat(ALPHA_MIN)), place.lt(S::load(group(last, first))));
+    if !S::any(blended) {
+        return None;
+    }
+    let zero = S::splat(0.0);
+    let alpha = S::select(blended, alpha, zero);
+    let inverse = S::splat(1.0).div(S::splat(1.0).sub(alpha));
     let transmittance = group_mut(&mut replay.transmittance, first);
-    let behind = group_mut(&mut replay.behind, first);
-    let [red_sum, green_sum, blue_sum] = colour_sums;
-    for lane in 0..LANES {
-        let d = offset + lane as f32;
-        let unclamped = exp2::<FUSED>(multiply_add::<FUSED>(-span.curvature * d, d, span.peak));
-        let clamps = unclamped >= ALPHA_MAX;
-        let alpha = if clamps { ALPHA_MAX } else { unclamped };
-        let blended = (alpha >= ALPHA_MIN) & (last[lane] > place);
-        let alpha = if blended { alpha } else { 0.0 };
-        let inverse = 1.0 / (1.0 - alpha);
-        let before = transmittance[lane] * inverse;
-        let weight = before * alpha;
-        let light = multiply_add::<FUSED>(
-            colour[0],
-            red[lane],
-            multiply_add::<FUSED>(colour[1], green[lane], colour[2] * blue[lane]),
-        );
-        // alpha · ∂loss/∂alpha, with ∂loss/∂alpha = T_before (c · g) - behind / (1 - alpha).
-        let v = weight * light - alpha * behind[lane] * inverse;
-        let v = if clamps { 0.0 } else { v };
-        let v_d = v * d;
-        row.v[lane] += v;
-        row.v_d[lane] += v_d;
-        row.v_dd[lane] = multiply_add::<FUSED>(v_d, d, row.v_dd[lane]);
-        red_sum[lane] = multiply_add::<FUSED>(weight, red[lane], red_sum[lane]);
-        green_sum[lane] = multiply_add::<FUSED>(weight, green[lane], green_sum[lane]);
-        blue_sum[lane] = multiply_add::<FUSED>(weight, blue[lane], blue_sum[lane]);
-        transmittance[lane] = before;
-        behind[lane] = multiply_add::<FUSED>(weight, light, behind[lane]);
+    let before = S::load(transmittance).mul(inverse);
+    before.store(transmittance);
+    let weight = before.mul(alpha);
+    let [red, green, blue] = &replay.gradient;
+    let light = S::splat(colour[0]).mul_add(
+        S::load(group(red, first)),
+        S::splat(colour[1])
+            .mul_add(S::load(group(green, first)), S::splat(colour[2]).mul(S::load(group(blue, first)))),
+    );
+    let behind_plane = group_mut(&mut replay.behind, first);
+    let behind = S::load(behind_plane);
+    // ∂loss/∂alpha = T_before (c · g) - behind / (1 - alpha).
+    let v = weight.mul(light).sub(alpha.mul(behind).mul(inverse));
+    weight.mul_add(light, behind).store(behind_plane);
+    Some(Undone { weight, v: S::select(unclamped.lt(largest), v, zero) })
+}
+
+struct RowSums<S> {
+    v: S,
+    v_d: S,
+    v_dd: S,
+}
+
+impl<S: Simd> RowSums<S> {
+    #[inline(always)]
+    fn zero() -> Self {
+        let zero = S::splat(0.0);
+        Self { v: zero, v_d: zero, v_dd: zero }
+    }
+
+    #[inline(always)]
+    fn add(&mut self, undone: &Undone<S>, offset: f32) {
+        let d = S::ramp().add(S::splat(offset));
+        let v_d = undone.v.mul(d);
+        self.v = self.v.add(undone.v);
+        self.v_d = self.v_d.add(v_d);
+        self.v_dd = v_d.mul_add(d, self.v_dd);
+    }
+}
+
+struct Sums<S> {
+    row: RowSums<S>,
+    v_y: S,
+    v_dy: S,
+    v_yy: S,
+    colour: [S; 3],
+}
+
+impl<S: Simd> Sums<S> {
+    #[inline(always)]
+    fn zero() -> Self {
+        let zero = S::splat(0.0);
+        Self { row: RowSums::zero(), v_y: zero, v_dy: zero, v_yy: zero, colour: [zero; 3] }
+    }
+
+    #[inline(always)]
+    fn add_colour(&mut self, undone: &Undone<S>, gradient: &[Vec<f32>; 3], first: usize) {
+        for (sum, plane) in self.colour.iter_mut().zip(gradient) {
+            *sum = undone.weight.mul_add(S::load(group(plane, first)), *sum);
+        }
+    }
+
+    #[inline(always)]
+    fn add_row(&mut self, row: &RowSums<S>, dy: f32) {
+        let dy = S::splat(dy);
+        let v_y = row.v.mul(dy);
+        self.row.v = self.row.v.add(row.v);
+        self.row.v_d = self.row.v_d.add(row.v_d);
+        self.row.v_dd = self.row.v_dd.add(row.v_dd);
+        self.v_y = self.v_y.add(v_y);
+        self.v_dy = row.v_d.mul_add(dy, self.v_dy);
+        self.v_yy = v_y.mul_add(dy, self.v_yy);
+    }
+
+    #[inline(always)]
+    fn reduce(&self) -> FootprintGradient {
+        FootprintGradient {
+            v: self.row.v.sum().into(),
+            v_d: self.row.v_d.sum().into(),
+            v_dd: self.row.v_dd.sum().into(),
+            v_y: self.v_y.sum().into(),
+            v_dy: self.v_dy.sum().into(),
+            v_yy: self.v_yy.sum().into(),
+            colour: self.colour.map(|sum| sum.sum().into()),
+        }
     }
 }

@@ -34,6 +34,8 @@ pub struct Footprint {
     pub inverse_yy: f64,
     /// Opacity in `[0, 1]`.
     pub opacity: f64,
+    /// Natural logarithm of the opacity.
+    pub log_opacity: f64,
     /// Exponent at which alpha falls to [`ALPHA_MIN`], `ln(opacity / ALPHA_MIN)`.
     pub reach: f64,
     /// Colour seen from the camera, not below 0.
@@ -133,7 +135,8 @@ fn footprint(
     sh_degree: u32,
 ) -> Option<Footprint> {
     let opacity = gaussians.opacity(index);
-    let reach = (opacity / f64::from(ALPHA_MIN)).ln();
+    let log_opacity = opacity.ln();
+    let reach = log_opacity - f64::from(ALPHA_MIN).ln();
     if !(reach >= 0.0) {
         return None;
     }
@@ -171,6 +174,7 @@ fn footprint(
         inverse_conditional: 1.0 / conditional,
         inverse_yy: 1.0 / yy,
         opacity,
+        log_opacity,
         reach,
         colour,
         first_band: (first_row / BAND_ROWS) as u32,

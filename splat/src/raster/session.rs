@@ -1,24 +1,162 @@
-//! placeholder
-use crate::engine::*;
-use crate::gaussians::Gaussians;
-use crate::optim::LearningRates;
-pub(super) struct CpuSession;
+//! An optimisation session of the CPU engine: parameters, optimiser state, images and buffers live as long as it does.
+
+use super::engine::{Pass, scatter};
+use crate::{
+    cameras::Camera,
+    engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
+    gaussians::{Gaussians, gradients::GaussianGradients},
+    image::Image,
+    loss::{LossWorkspace, PhotometricLoss},
+    optim::{Adam, LearningRates},
+};
+
+struct SessionView {
+    camera: Camera,
+    loss: PhotometricLoss,
+}
+
+/// See [`Session`].
+pub(super) struct CpuSession {
+    gaussians: Gaussians,
+    views: Vec<SessionView>,
+    background: [f32; 3],
+    /// Empty: all Gaussians are optimised.
+    active: Vec<bool>,
+    pass: Pass,
+    rendered: Image,
+    image_gradient: Vec<f32>,
+    workspace: LossWorkspace,
+    gradients: GaussianGradients,
+    adam: Adam,
+    density: DensityStatistics,
+}
+
 impl CpuSession {
-    pub(super) fn new(_: SessionInput) -> Result<Self, EngineError> {
-        Ok(Self)
+    pub(super) fn new(input: SessionInput) -> Result<Self, EngineError> {
+        check(&input)?;
+        let count = input.gaussians.len();
+        let views = input
+            .views
+            .iter()
+            .map(|view| SessionView {
+                camera: view.camera.clone(),
+                loss: PhotometricLoss::new(&view.image, view.mask.as_deref(), input.dssim_weight),
+            })
+            .collect();
+        Ok(Self {
+            adam: Adam::new(&input.gaussians),
+            gradients: GaussianGradients::zeros(&input.gaussians),
+            density: empty_statistics(count),
+            active: input.frozen.iter().map(|frozen| !frozen).collect(),
+            gaussians: input.gaussians,
+            views,
+            background: input.background,
+            pass: Pass::default(),
+            rendered: Image::filled(0, 0, [0.0; 3]),
+            image_gradient: Vec::new(),
+            workspace: LossWorkspace::default(),
+        })
+    }
+
+    fn prepare(&mut self, view: usize) {
+        let camera = &self.views[view].camera;
+        self.rendered.width = camera.width;
+        self.rendered.height = camera.height;
+        let values = self.rendered.pixel_count() * 3;
+        self.rendered.pixels.resize(values, 0.0);
+        self.image_gradient.resize(values, 0.0);
     }
 }
+
 impl Session for CpuSession {
-    fn step(&mut self, _: usize, _: &LearningRates) -> Result<StepReport, EngineError> {
-        todo!()
+    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<StepReport, EngineError> {
+        if view >= self.views.len() {
+            return Err(EngineError::InvalidInput(format!("view {view} of {}", self.views.len())));
+        }
+        self.prepare(view);
+        let SessionView { camera, loss } = &self.views[view];
+        self.pass.forward(
+            &self.gaussians,
+            camera,
+            rates.sh_degree,
+            self.background,
+            &mut self.rendered,
+            &mut [],
+        );
+        let value = loss.evaluate(&self.rendered, &mut self.workspace, &mut self.image_gradient);
+        let by_footprint = self.pass.backward(self.background, &self.image_gradient, &[], &self.active);
+        self.gradients.clear();
+        let geometry = scatter(
+            &self.gaussians,
+            camera,
+            rates.sh_degree,
+            &self.pass.bins,
+            &by_footprint,
+            &self.active,
+            &mut self.gradients,
+        );
+        let half_size = [camera.width as f32 / 2.0, camera.height as f32 / 2.0];
+        for (footprint, gradient) in self.pass.bins.footprints.iter().zip(&geometry) {
+            let [x, y] = gradient.projected_mean;
+            let index = footprint.index as usize;
+            self.density.gradient_norm[index] += (x * half_size[0]).hypot(y * half_size[1]);
+            self.density.visible_steps[index] += 1;
+        }
+        let active = (!self.active.is_empty()).then_some(self.active.as_slice());
+        self.adam.step(&mut self.gaussians, &self.gradients, rates, active);
+        Ok(StepReport { loss: value })
     }
+
     fn gaussians(&self) -> Result<Gaussians, EngineError> {
-        todo!()
+        Ok(self.gaussians.clone())
     }
+
     fn take_density_statistics(&mut self) -> Result<DensityStatistics, EngineError> {
-        todo!()
+        Ok(std::mem::replace(&mut self.density, empty_statistics(self.gaussians.len())))
     }
-    fn replace(&mut self, _: Gaussians, _: &[Option<usize>]) -> Result<(), EngineError> {
-        todo!()
+
+    fn replace(&mut self, gaussians: Gaussians, source: &[Option<usize>]) -> Result<(), EngineError> {
+        if source.len() != gaussians.len() {
+            return Err(EngineError::InvalidInput(format!(
+                "{} sources for {} Gaussians",
+                source.len(),
+                gaussians.len()
+            )));
+        }
+        if !self.active.is_empty() {
+            self.active = source.iter().map(|old| old.is_none_or(|old| self.active[old])).collect();
+        }
+        self.adam.replace(source);
+        self.gradients = GaussianGradients::zeros(&gaussians);
+        self.density = empty_statistics(gaussians.len());
+        self.gaussians = gaussians;
+        Ok(())
     }
+}
+
+fn empty_statistics(count: usize) -> DensityStatistics {
+    DensityStatistics { gradient_norm: vec![0.0; count], visible_steps: vec![0; count] }
+}
+
+fn check(input: &SessionInput) -> Result<(), EngineError> {
+    if input.views.is_empty() {
+        return Err(EngineError::InvalidInput("no training view; give at least one".into()));
+    }
+    let count = input.gaussians.len();
+    if !(input.frozen.is_empty() || input.frozen.len() == count) {
+        return Err(EngineError::InvalidInput(format!(
+            "{} frozen flags for {count} Gaussians",
+            input.frozen.len()
+        )));
+    }
+    for (number, view) in input.views.iter().enumerate() {
+        let (image, camera) = (&view.image, &view.camera);
+        if (image.width, image.height) != (camera.width, camera.height) {
+            return Err(EngineError::InvalidInput(format!(
+                "training image {number} is {}x{}, its camera {}x{}",
+                image.width, image.height, camera.width, camera.height
+            )));
+        }
+    }
+    Ok(())
 }

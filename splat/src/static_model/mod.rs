@@ -1,26 +1,24 @@
 //! Reconstruction of the key frame as a static set of Gaussians.
 
-use serde::{Deserialize, Serialize};
+mod densify;
+mod init;
+mod settings;
+#[cfg(test)]
+mod tests;
 
-use crate::settings::Quality;
+use std::ops::ControlFlow;
 
-/// How the key frame is reconstructed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct StaticModelSettings {}
+use rand::{SeedableRng, seq::SliceRandom};
+use rand_chacha::ChaCha8Rng;
 
-impl Default for StaticModelSettings {
-    fn default() -> Self {
-        Self::preset(Quality::default())
-    }
-}
+pub use settings::StaticModelSettings;
 
-impl StaticModelSettings {
-    /// The settings of a quality level.
-    pub fn preset(_quality: Quality) -> Self {
-        Self {}
-    }
-}
+use crate::{
+    cameras::Camera,
+    engine::{Engine, EngineError, Session, SessionInput, TrainingView},
+    gaussians::Gaussians,
+    optim::LearningRates,
+};
 
 /// A structure-from-motion point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -35,7 +33,7 @@ pub struct SfmPoint {
 #[derive(Clone, Debug)]
 pub struct StaticModelInput {
     /// Training images of the key frame; at least two.
-    pub views: Vec<crate::engine::TrainingView>,
+    pub views: Vec<TrainingView>,
     /// Structure-from-motion points; random points in the common frustum if empty.
     pub points: Vec<SfmPoint>,
     /// Colour behind everything.
@@ -67,17 +65,170 @@ pub enum StaticModelError {
     BadInput(String),
     /// The device failed.
     #[error(transparent)]
-    Engine(#[from] crate::engine::EngineError),
+    Engine(#[from] EngineError),
     /// The caller's progress function asked to stop.
     #[error("cancelled")]
     Cancelled,
 }
 
 /// Reconstructs the key frame; `progress` may stop it between steps.
+///
+/// 3D Gaussian Splatting (Kerbl et al. 2023) with adaptive density control under a hard cap, on a schedule that ends
+/// when the training loss flattens.
 pub fn reconstruct(
-    _engine: &dyn crate::engine::Engine,
-    _input: &StaticModelInput,
-    _progress: &mut dyn FnMut(StaticModelProgress) -> std::ops::ControlFlow<()>,
-) -> Result<crate::gaussians::Gaussians, StaticModelError> {
-    unimplemented!("lands with the static-model commit")
+    engine: &dyn Engine,
+    input: &StaticModelInput,
+    progress: &mut dyn FnMut(StaticModelProgress) -> ControlFlow<()>,
+) -> Result<Gaussians, StaticModelError> {
+    if input.views.len() < 2 {
+        return Err(StaticModelError::BadInput(format!(
+            "{} training view: a scene needs at least two; hold out fewer views",
+            input.views.len()
+        )));
+    }
+    let cameras: Vec<&Camera> = input.views.iter().map(|view| &view.camera).collect();
+    let extent = init::scene_extent(&cameras);
+    let mut random = ChaCha8Rng::seed_from_u64(input.seed);
+    let gaussians = initial(input, &cameras, &mut random)?;
+    let session = engine.session(SessionInput {
+        gaussians,
+        views: input.views.clone(),
+        background: input.background,
+        dssim_weight: input.settings.dssim_weight,
+        frozen: Vec::new(),
+    })?;
+    Optimisation { session, settings: &input.settings, extent, random, views: input.views.len() }
+        .run(progress)
+}
+
+fn initial(
+    input: &StaticModelInput,
+    cameras: &[&Camera],
+    random: &mut ChaCha8Rng,
+) -> Result<Gaussians, StaticModelError> {
+    let settings = &input.settings;
+    let drawn;
+    let points = if input.points.is_empty() {
+        drawn = init::random_points(cameras, settings.random_points.min(settings.max_gaussians), random);
+        &drawn
+    } else {
+        &input.points
+    };
+    if points.is_empty() {
+        return Err(StaticModelError::BadInput(
+            "no point of space is seen by two training views; check the poses or give sparse points".into(),
+        ));
+    }
+    let stride = points.len().div_ceil(settings.max_gaussians.max(1));
+    let thinned: Vec<SfmPoint> = points.iter().step_by(stride).copied().collect();
+    Ok(init::from_points(&thinned, settings.sh_degree))
+}
+
+struct Optimisation<'a> {
+    session: Box<dyn Session>,
+    settings: &'a StaticModelSettings,
+    extent: f64,
+    random: ChaCha8Rng,
+    views: usize,
+}
+
+impl Optimisation<'_> {
+    fn run(
+        mut self,
+        progress: &mut dyn FnMut(StaticModelProgress) -> ControlFlow<()>,
+    ) -> Result<Gaussians, StaticModelError> {
+        let steps = self.settings.max_steps;
+        let grow_until = (self.settings.densify_until * steps as f32) as u32;
+        let mut plateau = Plateau::new(self.settings.plateau_window, self.settings.plateau_improvement);
+        let mut order: Vec<usize> = Vec::new();
+        let mut count = self.session.gaussians()?.len();
+        for step in 0..steps {
+            let view = match order.pop() {
+                Some(view) => view,
+                None => {
+                    order = (0..self.views).collect();
+                    order.shuffle(&mut self.random);
+                    order.pop().unwrap_or(0)
+                }
+            };
+            let loss = self.session.step(view, &self.rates(step))?.loss;
+            let done = step + 1;
+            if done >= self.settings.densify_from
+                && done <= grow_until
+                && done.is_multiple_of(self.settings.densify_interval.max(1))
+            {
+                count = self.densify(done < grow_until)?;
+            }
+            let report = StaticModelProgress { step: done, steps, gaussians: count, loss };
+            if progress(report).is_break() {
+                return Err(StaticModelError::Cancelled);
+            }
+            if done > grow_until && plateau.is_reached(loss) {
+                break;
+            }
+        }
+        Ok(self.session.gaussians()?)
+    }
+
+    fn densify(&mut self, grow: bool) -> Result<usize, StaticModelError> {
+        let statistics = self.session.take_density_statistics()?;
+        let gaussians = self.session.gaussians()?;
+        let densified =
+            densify::densify(&gaussians, &statistics, self.settings, self.extent, grow, &mut self.random);
+        let count = densified.gaussians.len();
+        if count == 0 {
+            return Err(StaticModelError::BadInput(
+                "every Gaussian was pruned: the images show nothing that the cameras agree on; check the poses".into(),
+            ));
+        }
+        self.session.replace(densified.gaussians, &densified.source)?;
+        Ok(count)
+    }
+
+    fn rates(&self, step: u32) -> LearningRates {
+        let settings = self.settings;
+        let share = step as f32 / settings.max_steps.max(1) as f32;
+        let mean = settings.mean_rate.powf(1.0 - share) * settings.mean_rate_final.powf(share);
+        LearningRates {
+            mean: mean * self.extent as f32,
+            rotation: settings.rotation_rate,
+            log_scale: settings.log_scale_rate,
+            logit_opacity: settings.logit_opacity_rate,
+            sh_dc: settings.sh_dc_rate,
+            sh_rest: settings.sh_rest_rate,
+            sh_degree: (step / settings.sh_degree_interval.max(1)).min(settings.sh_degree),
+        }
+    }
+}
+
+/// Says when the mean loss of a window is hardly below that of the window before.
+pub(crate) struct Plateau {
+    window: u32,
+    improvement: f32,
+    seen: u32,
+    sum: f64,
+    previous: f64,
+}
+
+impl Plateau {
+    /// `window` steps per window; 0 never reaches a plateau.
+    pub(crate) fn new(window: u32, improvement: f32) -> Self {
+        Self { window, improvement, seen: 0, sum: 0.0, previous: f64::INFINITY }
+    }
+
+    /// Takes the loss of one step.
+    pub(crate) fn is_reached(&mut self, loss: f32) -> bool {
+        if self.window == 0 {
+            return false;
+        }
+        self.seen += 1;
+        self.sum += f64::from(loss);
+        if self.seen < self.window {
+            return false;
+        }
+        let mean = self.sum / f64::from(self.window);
+        let flat = mean > self.previous * (1.0 - f64::from(self.improvement));
+        (self.seen, self.sum, self.previous) = (0, 0.0, mean);
+        flat
+    }
 }
