@@ -4,6 +4,7 @@
 //! the standard deviations, logit of the opacity, unnormalised quaternion `w, x, y, z`.
 
 pub mod delta;
+pub mod gradients;
 pub mod sh;
 pub mod validate;
 
