@@ -253,8 +253,8 @@ fn a_file_of_another_tool_is_read() {
     let Ok(bytes) = std::fs::read(path) else { return };
     let gaussians = parse_ply(&bytes).unwrap();
     assert_eq!((gaussians.len(), gaussians.sh_degree), (100, 3));
-    // Same layout and normals of zero: writing it gives the same file.
-    assert!(write_ply(&gaussians) == bytes);
+    // Same layout and normals of zero: writing it gives the same bytes (the file goes on after its stated vertices).
+    assert!(bytes.starts_with(&write_ply(&gaussians)));
 }
 
 proptest! {
