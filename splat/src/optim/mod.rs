@@ -1,6 +1,12 @@
 //! Adam over the parameter classes of a set of Gaussians.
 
+mod adam;
+#[cfg(test)]
+mod tests;
+
 use serde::{Deserialize, Serialize};
+
+pub use self::adam::Adam;
 
 /// Step size per parameter class.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
