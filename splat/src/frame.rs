@@ -7,10 +7,13 @@ use thiserror::Error;
 
 use crate::{
     cameras::Camera,
-    engine::{Engine, EngineError},
+    engine::{Engine, EngineError, TrainingView},
     gaussians::Gaussians,
     image::{Image, Mask},
-    settings::Settings,
+    metrics,
+    motion::{self, MotionOrigin, MotionView},
+    refine::{self, RefineInput},
+    settings::{MaskUse, MotionSource, Settings},
     tracking::TrackField,
 };
 
@@ -122,10 +125,191 @@ pub enum FrameError {
 }
 
 /// Runs one frame job; `progress` may stop it between optimisation steps.
+///
+/// Motion compensation is undone where it renders the training views worse than no motion: a wrong start costs more
+/// than none.
 pub fn reconstruct_frame(
-    _engine: &dyn Engine,
-    _input: &FrameInput,
-    _progress: &mut dyn FnMut(FrameProgress) -> ControlFlow<()>,
+    engine: &dyn Engine,
+    input: &FrameInput,
+    progress: &mut dyn FnMut(FrameProgress) -> ControlFlow<()>,
 ) -> Result<FrameResult, FrameError> {
-    unimplemented!("lands with the refinement commit")
+    check(input)?;
+    let mut advance = |stage, done, total| match progress(FrameProgress { stage, done, total }) {
+        ControlFlow::Continue(()) => Ok(()),
+        ControlFlow::Break(()) => Err(FrameError::Cancelled),
+    };
+    advance("motion", 0, 1)?;
+    let start = compensate(engine, input)?;
+    let mut report =
+        FrameReport { motion: start.counts, rolled_back: start.rolled_back, ..FrameReport::default() };
+    advance("evaluate", 0, 1)?;
+    report.before = evaluate(engine, &start.gaussians, input)?;
+    if input.is_key_frame {
+        report.after = report.before.clone();
+        return Ok(FrameResult { gaussians: start.gaussians, report });
+    }
+    let refined = refine::refine(
+        engine,
+        RefineInput {
+            gaussians: start.gaussians.clone(),
+            views: training_views(input),
+            frozen: start.frozen,
+            background: input.settings.background,
+            seed: input.settings.seed,
+        },
+        &input.settings.refine,
+        &mut |done, total| match advance("refine", done.into(), total.into()) {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(_) => ControlFlow::Break(()),
+        },
+    )?
+    .ok_or(FrameError::Cancelled)?;
+    report.refine_steps = refined.steps;
+    report.refine_loss = refined.loss;
+    advance("evaluate", 0, 1)?;
+    report.after = evaluate(engine, &refined.gaussians, input)?;
+    Ok(FrameResult { gaussians: refined.gaussians, report })
+}
+
+fn check(input: &FrameInput) -> Result<(), FrameError> {
+    if input.training_views.is_empty() {
+        return Err(FrameError::BadInput("a frame without training views; hold out fewer".into()));
+    }
+    for view in input.training_views.iter().chain(&input.test_views) {
+        let size = (view.camera.width, view.camera.height);
+        if (view.image.width, view.image.height) != size {
+            return Err(FrameError::BadInput(format!(
+                "view {}: the image is {}x{}, its camera {}x{}; give images of the camera's size",
+                view.name, view.image.width, view.image.height, size.0, size.1
+            )));
+        }
+        if let Some(mask) = &view.mask
+            && (mask.width, mask.height) != size
+        {
+            return Err(FrameError::BadInput(format!(
+                "view {}: the mask is {}x{}, its camera {}x{}; give masks of the camera's size",
+                view.name, mask.width, mask.height, size.0, size.1
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Gaussians that refinement starts from.
+struct Start {
+    gaussians: Gaussians,
+    frozen: Vec<bool>,
+    counts: MotionCounts,
+    rolled_back: bool,
+}
+
+fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameError> {
+    let still = |rolled_back, counts| Start {
+        gaussians: input.static_model.as_ref().clone(),
+        frozen: Vec::new(),
+        counts,
+        rolled_back,
+    };
+    let views: Vec<MotionView> = input
+        .training_views
+        .iter()
+        .filter_map(|view| {
+            view.tracks.clone().map(|tracks| MotionView { camera: view.camera.clone(), tracks })
+        })
+        .collect();
+    if input.is_key_frame || views.is_empty() || input.settings.motion_source == MotionSource::None {
+        return Ok(still(false, MotionCounts::default()));
+    }
+    let field = motion::estimate(engine, &input.static_model, &views, &input.settings.motion)?;
+    let counts = count(&field.origin);
+    let gaussians = motion::apply(&input.static_model, &field);
+    if training_psnr(engine, &gaussians, input)? < training_psnr(engine, &input.static_model, input)? {
+        return Ok(still(true, counts));
+    }
+    let frozen = if input.settings.refine.freeze_static {
+        field.origin.iter().map(|&origin| origin == MotionOrigin::Static).collect()
+    } else {
+        Vec::new()
+    };
+    Ok(Start { gaussians, frozen, counts, rolled_back: false })
+}
+
+fn count(origins: &[MotionOrigin]) -> MotionCounts {
+    let mut counts = MotionCounts::default();
+    for origin in origins {
+        *match origin {
+            MotionOrigin::Static => &mut counts.r#static,
+            MotionOrigin::Solved => &mut counts.solved,
+            MotionOrigin::Propagated => &mut counts.propagated,
+            MotionOrigin::Unsolved => &mut counts.unsolved,
+        } += 1;
+    }
+    counts
+}
+
+fn training_views(input: &FrameInput) -> Vec<TrainingView> {
+    input
+        .training_views
+        .iter()
+        .map(|view| TrainingView {
+            camera: view.camera.clone(),
+            image: view.image.clone(),
+            mask: view.mask.clone().filter(|_| input.settings.masks == MaskUse::Train),
+        })
+        .collect()
+}
+
+/// Mean PSNR over the training views, dB.
+fn training_psnr(engine: &dyn Engine, gaussians: &Gaussians, input: &FrameInput) -> Result<f64, FrameError> {
+    let views = training_views(input);
+    let mut sum = 0.0;
+    for view in &views {
+        let rendered = engine.render(gaussians, &view.camera, input.settings.background)?.image;
+        sum += match &view.mask {
+            Some(mask) => metrics::masked_psnr(&rendered, &view.image, mask).unwrap_or(0.0),
+            None => metrics::psnr(&rendered, &view.image),
+        };
+    }
+    Ok(sum / views.len() as f64)
+}
+
+/// Metrics on every test view, then their mean.
+fn evaluate(
+    engine: &dyn Engine,
+    gaussians: &Gaussians,
+    input: &FrameInput,
+) -> Result<Vec<ViewMetrics>, FrameError> {
+    let mut metrics = Vec::with_capacity(input.test_views.len() + 1);
+    for view in &input.test_views {
+        let rendered = engine.render(gaussians, &view.camera, input.settings.background)?.image;
+        let moving = view.mask.as_deref().filter(|_| input.settings.masks == MaskUse::Evaluate);
+        metrics.push(view_metrics(&view.name, &rendered, &view.image, moving));
+    }
+    metrics.extend(mean(&metrics));
+    Ok(metrics)
+}
+
+/// Quality of one rendered view; `moving` marks the moving region.
+pub fn view_metrics(name: &str, rendered: &Image, truth: &Image, moving: Option<&Mask>) -> ViewMetrics {
+    ViewMetrics {
+        view: name.to_owned(),
+        psnr: metrics::psnr(rendered, truth),
+        ssim: metrics::ssim(rendered, truth),
+        moving_psnr: moving.and_then(|mask| metrics::masked_psnr(rendered, truth, mask)),
+    }
+}
+
+/// Mean over views, named `mean`; `None` without views.
+pub fn mean(views: &[ViewMetrics]) -> Option<ViewMetrics> {
+    if views.is_empty() {
+        return None;
+    }
+    let average = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let moving: Vec<f64> = views.iter().filter_map(|view| view.moving_psnr).collect();
+    Some(ViewMetrics {
+        view: "mean".to_owned(),
+        psnr: average(&views.iter().map(|view| view.psnr).collect::<Vec<_>>()),
+        ssim: average(&views.iter().map(|view| view.ssim).collect::<Vec<_>>()),
+        moving_psnr: (!moving.is_empty()).then(|| average(&moving)),
+    })
 }

@@ -1,6 +1,7 @@
 //! Pinhole cameras in OpenCV axes: x right, y down, z forward; the centre of the top-left pixel is (0.5, 0.5).
 
 pub mod distortion;
+pub mod rig;
 
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};

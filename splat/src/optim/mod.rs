@@ -1,12 +1,16 @@
-//! Adam over the parameter classes of a set of Gaussians.
+//! Adam over the parameter classes of a set of Gaussians, and the schedule of its steps.
 
 mod adam;
+mod schedule;
 #[cfg(test)]
 mod tests;
 
 use serde::{Deserialize, Serialize};
 
-pub use self::adam::Adam;
+pub use self::{
+    adam::Adam,
+    schedule::{Epochs, Plateau},
+};
 
 /// Step size per parameter class.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -8,16 +8,16 @@ mod tests;
 
 use std::ops::ControlFlow;
 
-use rand::{SeedableRng, seq::SliceRandom};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 pub use settings::StaticModelSettings;
 
 use crate::{
-    cameras::Camera,
+    cameras::{Camera, rig::scene_extent},
     engine::{Engine, EngineError, Session, SessionInput, TrainingView},
     gaussians::Gaussians,
-    optim::LearningRates,
+    optim::{Epochs, LearningRates, Plateau},
 };
 
 /// A structure-from-motion point.
@@ -87,7 +87,7 @@ pub fn reconstruct(
         )));
     }
     let cameras: Vec<&Camera> = input.views.iter().map(|view| &view.camera).collect();
-    let extent = init::scene_extent(&cameras);
+    let extent = scene_extent(&cameras);
     let mut random = ChaCha8Rng::seed_from_u64(input.seed);
     let gaussians = initial(input, &cameras, &mut random)?;
     let session = engine.session(SessionInput {
@@ -140,17 +140,10 @@ impl Optimisation<'_> {
         let steps = self.settings.max_steps;
         let grow_until = (self.settings.densify_until * steps as f32) as u32;
         let mut plateau = Plateau::new(self.settings.plateau_window, self.settings.plateau_improvement);
-        let mut order: Vec<usize> = Vec::new();
+        let mut epochs = Epochs::new(self.views);
         let mut count = self.session.gaussians()?.len();
         for step in 0..steps {
-            let view = match order.pop() {
-                Some(view) => view,
-                None => {
-                    order = (0..self.views).collect();
-                    order.shuffle(&mut self.random);
-                    order.pop().unwrap_or(0)
-                }
-            };
+            let view = epochs.next(&mut self.random);
             let loss = self.session.step(view, &self.rates(step))?.loss;
             let done = step + 1;
             if done >= self.settings.densify_from
@@ -198,37 +191,5 @@ impl Optimisation<'_> {
             sh_rest: settings.sh_rest_rate,
             sh_degree: (step / settings.sh_degree_interval.max(1)).min(settings.sh_degree),
         }
-    }
-}
-
-/// Says when the mean loss of a window is hardly below that of the window before.
-pub(crate) struct Plateau {
-    window: u32,
-    improvement: f32,
-    seen: u32,
-    sum: f64,
-    previous: f64,
-}
-
-impl Plateau {
-    /// `window` steps per window; 0 never reaches a plateau.
-    pub(crate) fn new(window: u32, improvement: f32) -> Self {
-        Self { window, improvement, seen: 0, sum: 0.0, previous: f64::INFINITY }
-    }
-
-    /// Takes the loss of one step.
-    pub(crate) fn is_reached(&mut self, loss: f32) -> bool {
-        if self.window == 0 {
-            return false;
-        }
-        self.seen += 1;
-        self.sum += f64::from(loss);
-        if self.seen < self.window {
-            return false;
-        }
-        let mean = self.sum / f64::from(self.window);
-        let flat = mean > self.previous * (1.0 - f64::from(self.improvement));
-        (self.seen, self.sum, self.previous) = (0, 0.0, mean);
-        flat
     }
 }

@@ -1,0 +1,66 @@
+//! How a frame is refined after motion compensation.
+
+use serde::{Deserialize, Serialize};
+
+use crate::settings::Quality;
+
+/// Settings of the refinement. Rates are those of TrackerSplat's released code (1000 steps per frame), which are those
+/// of 3D Gaussian Splatting.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RefineSettings {
+    /// Optimisation steps at most, one view each; 0 leaves the compensated Gaussians as they are.
+    pub iterations: u32,
+    /// Whether Gaussians that motion compensation calls static are left out of the optimisation.
+    pub freeze_static: bool,
+    /// Weight of the structural term in the loss, 0 to 1.
+    pub dssim_weight: f32,
+    /// Rate of the means, in scene extents per step.
+    pub mean_rate: f32,
+    /// Rate of the quaternions.
+    pub rotation_rate: f32,
+    /// Rate of the log scales.
+    pub log_scale_rate: f32,
+    /// Rate of the logit opacities.
+    pub logit_opacity_rate: f32,
+    /// Rate of the spherical harmonics of degree 0.
+    pub sh_dc_rate: f32,
+    /// Rate of the higher spherical harmonics.
+    pub sh_rest_rate: f32,
+    /// Share of every rate that is left at the last step; the rates fall exponentially towards it.
+    pub final_rate_share: f32,
+    /// Steps over which the loss is compared with the same number before; 0 never stops early.
+    pub plateau_window: u32,
+    /// The optimisation stops when the loss fell by less than this share from window to window.
+    pub plateau_improvement: f32,
+}
+
+impl Default for RefineSettings {
+    fn default() -> Self {
+        Self::preset(Quality::default())
+    }
+}
+
+impl RefineSettings {
+    /// The settings of a quality level.
+    pub fn preset(quality: Quality) -> Self {
+        Self {
+            iterations: match quality {
+                Quality::Draft => 100,
+                Quality::Balanced => 300,
+                Quality::Best => 1000,
+            },
+            freeze_static: false,
+            dssim_weight: 0.2,
+            mean_rate: 1.6e-4,
+            rotation_rate: 1e-3,
+            log_scale_rate: 5e-3,
+            logit_opacity_rate: 0.025,
+            sh_dc_rate: 2.5e-3,
+            sh_rest_rate: 1.25e-4,
+            final_rate_share: 0.1,
+            plateau_window: 80,
+            plateau_improvement: 0.01,
+        }
+    }
+}
