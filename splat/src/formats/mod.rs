@@ -3,3 +3,8 @@
 pub(crate) mod byte_planes;
 pub mod container;
 pub mod ply;
+pub mod track_blob;
+pub mod track_error;
+pub mod track_npz;
+
+pub use self::track_error::TrackError;

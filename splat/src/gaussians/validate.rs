@@ -80,6 +80,8 @@ fn check(
 mod tests {
     use super::*;
 
+    type Spoil = fn(&mut Gaussians);
+
     fn valid() -> Gaussians {
         Gaussians {
             means: vec![[1.0, 2.0, 3.0]; 4],
@@ -102,7 +104,7 @@ mod tests {
 
     #[test]
     fn broken_values_are_named() {
-        let cases: [(&str, fn(&mut Gaussians)); 5] = [
+        let cases: [(&str, Spoil); 5] = [
             ("Gaussian 2, `means` is NaN", |set| set.means[2][1] = f32::NAN),
             ("Gaussian 0, `rotations` is inf", |set| set.rotations[0][3] = f32::INFINITY),
             ("Gaussian 3, `log_scales` is -inf", |set| set.log_scales[3][0] = f32::NEG_INFINITY),
@@ -119,7 +121,7 @@ mod tests {
 
     #[test]
     fn broken_shapes_are_named() {
-        let cases: [(&str, fn(&mut Gaussians)); 6] = [
+        let cases: [(&str, Spoil); 6] = [
             ("`rotations` has 20 values, 16", |set| set.rotations.push([1.0; 4])),
             ("`log_scales` has 9 values, 12", |set| set.log_scales.truncate(3)),
             ("`logit_opacities` has 0 values, 4", |set| set.logit_opacities.clear()),
