@@ -1,0 +1,237 @@
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use std::{io::Write, path::PathBuf};
+
+use npyz::WriterBuilder;
+use zip::{ZipWriter, write::SimpleFileOptions};
+
+use super::*;
+
+/// An npz under construction.
+struct Npz {
+    folder: tempfile::TempDir,
+    zip: ZipWriter<File>,
+}
+
+impl Npz {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let zip = ZipWriter::new(File::create(folder.path().join("tracks.npz")).unwrap());
+        Self { folder, zip }
+    }
+
+    fn array<T: npyz::AutoSerialize + Copy>(self, name: &str, shape: &[u64], values: &[T]) -> Self {
+        self.ordered(name, shape, values, Order::C)
+    }
+
+    fn ordered<T: npyz::AutoSerialize + Copy>(
+        mut self,
+        name: &str,
+        shape: &[u64],
+        values: &[T],
+        order: Order,
+    ) -> Self {
+        let mut bytes = Vec::new();
+        let options = npyz::WriteOptions::new().default_dtype().order(order).shape(shape);
+        let mut writer = options.writer(&mut bytes).begin_nd().unwrap();
+        writer.extend(values.iter().copied()).unwrap();
+        writer.finish().unwrap();
+        self.zip.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
+        self.zip.write_all(&bytes).unwrap();
+        self
+    }
+
+    fn finish(self) -> (tempfile::TempDir, PathBuf) {
+        self.zip.finish().unwrap();
+        let path = self.folder.path().join("tracks.npz");
+        (self.folder, path)
+    }
+}
+
+/// Two later frames of 3 × 3 pixels: nine pixels do not fill whole bytes.
+fn flow() -> Npz {
+    let flow: Vec<i16> = (0..36).map(|value| 16 * value - 200).collect();
+    Npz::new().array("flow_x64", &[2, 3, 3, 2], &flow)
+}
+
+#[test]
+fn exact_flow_is_read() {
+    let (_folder, path) = flow()
+        .array("visible", &[2, 2], &[0b1010_0001_u8, 0b1000_0000, 0b0000_0000, 0b1000_0000])
+        .array("valid", &[2], &[0b1110_1111_u8, 0b1000_0000])
+        .finish();
+    let fields = read_exact_flow(&path).unwrap();
+    assert_eq!(fields.len(), 2);
+    let first = &fields[0];
+    assert_eq!((first.width, first.height), (3, 3));
+    assert_eq!(first.positions[0], [0.5 - 3.125, 0.5 - 2.875]);
+    // Pixel 4 is at column 1, row 1; its flow has indices 8 and 9.
+    assert_eq!(first.positions[4], [1.5 - 1.125, 1.5 - 0.875]);
+    assert_eq!(fields[1].positions[8], [2.5 + 5.375, 2.5 + 5.625]);
+    assert_eq!(first.visible, [true, false, true, false, false, false, false, true, true]);
+    assert_eq!(fields[1].visible, [false, false, false, false, false, false, false, false, true]);
+    assert!(first.sigma.iter().all(|&sigma| (sigma - 0.065625).abs() < 1e-7));
+}
+
+#[test]
+fn invalid_flow_is_invisible() {
+    let (_folder, path) = flow()
+        .array("visible", &[2, 2], &[0xff_u8; 4])
+        .array("valid", &[2], &[0b0111_1111_u8, 0x80])
+        .finish();
+    for field in read_exact_flow(&path).unwrap() {
+        assert_eq!(field.visible, [false, true, true, true, true, true, true, true, true]);
+    }
+}
+
+#[test]
+fn visibility_may_be_packed_without_row_ends() {
+    // 18 bits in a row: frame 1 sees pixel 0 only, frame 2 pixels 0 and 8.
+    let (_folder, path) = flow()
+        .array("visible", &[3], &[0b1000_0000_u8, 0b0100_0000, 0b0100_0000])
+        .array("valid", &[2], &[0xff_u8; 2])
+        .finish();
+    let fields = read_exact_flow(&path).unwrap();
+    let seen = |field: &TrackField| (0..9).filter(|&index| field.visible[index]).collect::<Vec<_>>();
+    assert_eq!((seen(&fields[0]), seen(&fields[1])), (vec![0], vec![0, 8]));
+}
+
+#[test]
+fn a_rendered_clip_is_read() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/clips/dev-slide/flow/cam00.npz");
+    if !path.exists() {
+        return;
+    }
+    let fields = read_exact_flow(&path).unwrap();
+    assert_eq!(fields.len(), 9);
+    for field in fields {
+        assert_eq!((field.width, field.height), (320, 180));
+        // Occlusion and the image border hide some; most of the room stands still.
+        let visible = field.visible.iter().filter(|&&visible| visible).count();
+        assert!((30_000..57_600).contains(&visible), "{visible}");
+        // Whatever is visible at the frame is inside its image.
+        let inside = |p: &[f32; 2]| (-0.5..320.5).contains(&p[0]) && (-0.5..180.5).contains(&p[1]);
+        assert!(field.positions.iter().zip(&field.visible).all(|(p, visible)| !visible || inside(p)));
+    }
+}
+
+#[test]
+fn a_trackers_fields_are_read_whatever_their_number_type() {
+    // Two frames of 1 × 2 pixels; the key frame is skipped.
+    let positions = [0.5, 0.5, 1.5, 0.5, 3.25, 4.5, -1.0, 0.125];
+    let narrow = positions.map(|value| value as f32);
+    let files = [
+        Npz::new().array("tracks", &[2, 1, 2, 2], &positions).array(
+            "visible",
+            &[2, 1, 2],
+            &[true, true, true, false],
+        ),
+        Npz::new().array("positions", &[2, 1, 2, 2], &narrow).array(
+            "visibility",
+            &[2, 1, 2],
+            &[1_u8, 1, 1, 0],
+        ),
+        Npz::new().array("tracks", &[2, 1, 2, 2], &narrow).array(
+            "visible",
+            &[2, 1, 2],
+            &[1.0, 0.0, 0.51, 0.5],
+        ),
+    ];
+    for file in files {
+        let (_folder, path) = file.finish();
+        let expected = TrackField {
+            width: 2,
+            height: 1,
+            positions: vec![[3.25, 4.5], [-1.0, 0.125]],
+            visible: vec![true, false],
+            sigma: vec![DEFAULT_SIGMA; 2],
+        };
+        assert_eq!(read_track_npz(&path).unwrap(), [expected]);
+    }
+}
+
+#[test]
+fn stated_deviations_are_taken_and_unknown_positions_hidden() {
+    let positions = [[0.0_f32; 2]; 6].concat();
+    let later = [2.0, 2.0, f32::NAN, 2.0, 2.0, f32::INFINITY, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0];
+    let (_folder, path) = Npz::new()
+        .array("tracks", &[2, 2, 3, 2], &[positions, later.to_vec()].concat())
+        .array("visible", &[2, 2, 3], &[1_u8; 12])
+        .array("sigma", &[2, 2, 3], &[1.0_f32, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0, 0.0, -1.0, f32::NAN])
+        .finish();
+    let field = read_track_npz(&path).unwrap().remove(0);
+    assert_eq!(field.visible, [true, false, false, true, false, false]);
+    assert_eq!(field.sigma, [3.0, DEFAULT_SIGMA, DEFAULT_SIGMA, SIGMA_FLOOR, DEFAULT_SIGMA, DEFAULT_SIGMA]);
+    assert_eq!((field.positions[1], field.positions[5]), ([1.5, 0.5], [2.5, 1.5]));
+}
+
+#[test]
+fn errors_name_file_array_and_shapes() {
+    let cases: [(Npz, &[&str]); 6] = [
+        (Npz::new().array("flow", &[2], &[0_u8; 2]), &["no array `tracks` or `positions`", "it holds: flow"]),
+        (Npz::new().array("tracks", &[2, 2], &[0.0; 4]), &["`tracks` has shape [2, 2]", "[T, H, W, 2]"]),
+        (
+            Npz::new().array("tracks", &[1, 0, 2, 2], &[0.0; 0]),
+            &["`tracks` has shape [1, 0, 2, 2]", "between 1 and"],
+        ),
+        (
+            Npz::new().array("tracks", &[1, 1, 2, 2], &[0.0; 4]).array("visible", &[2, 1], &[true; 2]),
+            &["`visible` has shape [2, 1]", "expected [1, 1, 2], the shape of `tracks`"],
+        ),
+        (Npz::new().array("tracks", &[1, 1, 1, 2], &[0_i64; 2]), &["`tracks`", "i8", "expected f32, f64"]),
+        (
+            Npz::new().ordered("tracks", &[1, 1, 1, 2], &[0.0; 2], Order::Fortran),
+            &["`tracks`", "Fortran order", "ascontiguousarray"],
+        ),
+    ];
+    for (npz, expected) in cases {
+        let (_folder, path) = npz.finish();
+        let message = read_track_npz(&path).unwrap_err().to_string();
+        assert!(message.contains("tracks.npz"), "{message}");
+        assert!(expected.iter().all(|part| message.contains(part)), "{message}");
+    }
+}
+
+#[test]
+fn errors_of_exact_flow_name_what_is_wrong() {
+    let cases: [(Npz, &str); 4] = [
+        (Npz::new().array("flow_x64", &[1, 1, 1, 2], &[0.0; 2]), "expected i16"),
+        (Npz::new().array("flow_x64", &[1, 2], &[0_i16; 2]), "has shape [1, 2], expected [T-1, H, W, 2]"),
+        (flow().array("visible", &[5], &[0_u8; 5]), "`visible` has shape [5], expected [2, 2]"),
+        (
+            flow().array("visible", &[2, 2], &[0_u8; 4]).array("valid", &[9], &[1_u8; 9]),
+            "`valid` has shape [9], expected [2]",
+        ),
+    ];
+    for (npz, expected) in cases {
+        let (_folder, path) = npz.finish();
+        let message = read_exact_flow(&path).unwrap_err().to_string();
+        assert!(message.contains("tracks.npz") && message.contains(expected), "{message}");
+    }
+}
+
+#[test]
+fn files_that_are_no_archives_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("flow.npz");
+    assert!(read_exact_flow(&path).unwrap_err().to_string().contains("flow.npz: cannot read"));
+    std::fs::write(&path, b"not a zip").unwrap();
+    assert!(read_track_npz(&path).unwrap_err().to_string().contains("flow.npz: cannot read"));
+}
+
+#[test]
+fn shapes_that_boast_are_refused() {
+    let mut bytes = Vec::new();
+    let options = npyz::WriteOptions::new().default_dtype().shape(&[1, 1, 1, 2]);
+    let mut writer = options.writer(&mut bytes).begin_nd().unwrap();
+    writer.extend([0.0_f32, 0.0]).unwrap();
+    writer.finish().unwrap();
+    let shape = bytes.windows(7).position(|window| window == b"1, 1, 1").unwrap();
+    bytes[shape..shape + 7].copy_from_slice(b"9, 9, 9");
+    let mut npz = Npz::new();
+    npz.zip.start_file("tracks.npy", SimpleFileOptions::default()).unwrap();
+    npz.zip.write_all(&bytes).unwrap();
+    let (_folder, path) = npz.finish();
+    let message = read_track_npz(&path).unwrap_err().to_string();
+    assert!(message.contains("needs more than"), "{message}");
+}
