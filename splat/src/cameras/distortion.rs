@@ -58,8 +58,7 @@ impl Distortion {
     ///
     /// The map is one to one where its Jacobian stays positive definite; a fold always has another sign there.
     pub fn fold_within(&self, camera: &Camera) -> Option<DVec2> {
-        let step =
-            DVec2::new(f64::from(camera.width), f64::from(camera.height)) / f64::from(FOLD_GRID);
+        let step = DVec2::new(f64::from(camera.width), f64::from(camera.height)) / f64::from(FOLD_GRID);
         let corners = 0..=FOLD_GRID;
         corners
             .clone()
@@ -128,7 +127,8 @@ impl UndistortMap {
 fn bilinear(image: &Image, [x, y]: [f32; 2]) -> [f32; 3] {
     let (left, right, u) = neighbours(x, image.width);
     let (top, bottom, v) = neighbours(y, image.height);
-    let corners = [image.at(left, top), image.at(right, top), image.at(left, bottom), image.at(right, bottom)];
+    let corners =
+        [image.at(left, top), image.at(right, top), image.at(left, bottom), image.at(right, bottom)];
     std::array::from_fn(|channel| {
         let [a, b, c, d] = corners.map(|colour| colour[channel]);
         let (upper, lower) = (a + u * (b - a), c + u * (d - c));
@@ -177,7 +177,8 @@ mod tests {
     /// A scene without edges, so that bilinear sampling errors stay small.
     fn radiance(ideal: DVec2) -> [f32; 3] {
         let DVec2 { x, y } = ideal;
-        [0.5 + 0.4 * (3.0 * x).sin(), 0.5 + 0.4 * (2.0 * y).cos(), 0.5 + 0.3 * (2.0 * x * y).sin()].map(|v| v as f32)
+        [0.5 + 0.4 * (3.0 * x).sin(), 0.5 + 0.4 * (2.0 * y).cos(), 0.5 + 0.3 * (2.0 * x * y).sin()]
+            .map(|v| v as f32)
     }
 
     fn picture(camera: &Camera, seen_at: impl Fn(DVec2) -> DVec2) -> Image {
@@ -186,7 +187,8 @@ mod tests {
             for column in 0..camera.width {
                 let centre = DVec2::new(f64::from(column) + 0.5, f64::from(row) + 0.5);
                 let first = ((row * camera.width + column) * 3) as usize;
-                image.pixels[first..first + 3].copy_from_slice(&radiance(seen_at(normalised(camera, centre))));
+                image.pixels[first..first + 3]
+                    .copy_from_slice(&radiance(seen_at(normalised(camera, centre))));
             }
         }
         image
@@ -199,7 +201,8 @@ mod tests {
             let residual = lens.apply(ideal) - distorted;
             let [a, b, c] = lens.jacobian(ideal);
             let determinant = a * c - b * b;
-            ideal -= DVec2::new(c * residual.x - b * residual.y, a * residual.y - b * residual.x) / determinant;
+            ideal -=
+                DVec2::new(c * residual.x - b * residual.y, a * residual.y - b * residual.x) / determinant;
         }
         ideal
     }
@@ -238,8 +241,12 @@ mod tests {
         let undistorted = UndistortMap::new(&camera, &LENS).image(&photograph);
         let worst = |image: &Image| {
             // The border may fall outside the photograph; the rest must agree.
-            let inner = (3..camera.height as usize - 3).flat_map(|y| (3..camera.width as usize - 3).map(move |x| (x, y)));
-            inner.flat_map(|(x, y)| std::array::from_fn::<_, 3, _>(|c| (image.at(x, y)[c] - pinhole.at(x, y)[c]).abs()))
+            let inner = (3..camera.height as usize - 3)
+                .flat_map(|y| (3..camera.width as usize - 3).map(move |x| (x, y)));
+            inner
+                .flat_map(|(x, y)| {
+                    std::array::from_fn::<_, 3, _>(|c| (image.at(x, y)[c] - pinhole.at(x, y)[c]).abs())
+                })
                 .fold(0.0_f32, f32::max)
         };
         // Bilinear interpolation errs by f'' h²/8 per axis: 3.6 / 80² / 8 = 7e-5 here.
@@ -281,7 +288,8 @@ mod tests {
         let lens = Distortion { k1: 0.2, ..Distortion::default() };
         let ideal = DVec2::new(0.3, 0.2);
         let at = |position: DVec2| {
-            let pixel = (DVec2::new(camera.fx, camera.fy) * position + DVec2::new(camera.cx, camera.cy)).floor();
+            let pixel =
+                (DVec2::new(camera.fx, camera.fy) * position + DVec2::new(camera.cx, camera.cy)).floor();
             pixel.y as usize * 96 + pixel.x as usize
         };
         let mut mask = Mask { width: 96, height: 64, inside: vec![false; 96 * 64] };

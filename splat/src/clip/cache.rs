@@ -98,7 +98,8 @@ impl Cache {
         let replaced = held.entries.insert(key, slot).map_or(0, |old| old.bytes);
         held.bytes = held.bytes - replaced + bytes;
         while held.bytes > self.budget {
-            let Some(oldest) = held.entries.iter().min_by_key(|(_, slot)| slot.used).map(|(key, _)| *key) else {
+            let Some(oldest) = held.entries.iter().min_by_key(|(_, slot)| slot.used).map(|(key, _)| *key)
+            else {
                 return;
             };
             held.bytes -= held.entries.remove(&oldest).map_or(0, |slot| slot.bytes);

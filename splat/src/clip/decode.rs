@@ -36,10 +36,12 @@ pub(super) fn mask_png(mask: &Mask) -> Vec<u8> {
 
 /// Columns and rows from the file's header alone.
 pub(super) fn image_size(path: &Path) -> Result<[u32; 2], ClipError> {
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(ClipError::io(path))?;
-    let (width, height) = reader
-        .into_dimensions()
-        .map_err(|source| ClipError::Undecodable { path: path.to_owned(), source: DecodeError::Corrupt(source) })?;
+    let reader =
+        ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(ClipError::io(path))?;
+    let (width, height) = reader.into_dimensions().map_err(|source| ClipError::Undecodable {
+        path: path.to_owned(),
+        source: DecodeError::Corrupt(source),
+    })?;
     Ok([width, height])
 }
 
@@ -60,7 +62,9 @@ mod tests {
     use super::*;
 
     fn encoded(format: ImageFormat) -> Vec<u8> {
-        let picture = image::RgbImage::from_fn(40, 30, |x, y| image::Rgb([(x * 6) as u8, (y * 8) as u8, (x * y) as u8]));
+        let picture = image::RgbImage::from_fn(40, 30, |x, y| {
+            image::Rgb([(x * 6) as u8, (y * 8) as u8, (x * y) as u8])
+        });
         let mut bytes = Cursor::new(Vec::new());
         picture.write_to(&mut bytes, format).expect("encoded");
         bytes.into_inner()
@@ -75,7 +79,8 @@ mod tests {
             assert_eq!([picture.width, picture.height], [40, 30], "{format:?} by content, not by name");
             for kept in [0, 1, 10, bytes.len() / 4, bytes.len() / 2, bytes.len() * 3 / 4, bytes.len() - 13] {
                 let error = image(path, &bytes[..kept]).err();
-                let error = error.unwrap_or_else(|| panic!("{format:?} cut to {kept} of {} bytes", bytes.len()));
+                let error =
+                    error.unwrap_or_else(|| panic!("{format:?} cut to {kept} of {} bytes", bytes.len()));
                 assert!(error.to_string().contains("frame_0001.png"));
                 assert!(mask(path, &bytes[..kept]).is_err());
             }

@@ -11,7 +11,7 @@ use crate::static_model::SfmPoint;
 /// Changes whenever the same files would give other images, cameras or points.
 const FORMAT: &str = "trackersplat clip 1";
 
-/// BLAKE3 of everything a clip's content decides; equal whatever the folder is called or the layout is.
+/// BLAKE3 of cameras, splits, frame numbers, points and file contents, each preceded by its length or count.
 pub(super) fn clip(
     views: &[View],
     sources: &[Source],
@@ -21,7 +21,9 @@ pub(super) fn clip(
     let mut hasher = Hasher::new();
     text(&mut hasher, FORMAT);
     count(&mut hasher, frames.len());
-    frames.iter().for_each(|frame| { hasher.update(&frame.to_le_bytes()); });
+    frames.iter().for_each(|frame| {
+        hasher.update(&frame.to_le_bytes());
+    });
     count(&mut hasher, points.len());
     points.iter().for_each(|point| self::point(&mut hasher, point));
     count(&mut hasher, views.len());
@@ -77,11 +79,15 @@ fn camera(hasher: &mut Hasher, view: &View, source: &Source) {
 
 fn point(hasher: &mut Hasher, point: &SfmPoint) {
     numbers(hasher, &point.position.to_array());
-    point.colour.iter().for_each(|channel| { hasher.update(&channel.to_le_bytes()); });
+    point.colour.iter().for_each(|channel| {
+        hasher.update(&channel.to_le_bytes());
+    });
 }
 
 fn numbers(hasher: &mut Hasher, values: &[f64]) {
-    values.iter().for_each(|value| { hasher.update(&value.to_le_bytes()); });
+    values.iter().for_each(|value| {
+        hasher.update(&value.to_le_bytes());
+    });
 }
 
 fn count(hasher: &mut Hasher, length: usize) {

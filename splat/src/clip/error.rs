@@ -112,7 +112,9 @@ pub enum ClipError {
         expected: &'static str,
     },
     /// A pose that is not a rigid motion.
-    #[error("{path}: the pose of view {view} {problem}; export the camera again as a rigid world-to-camera motion")]
+    #[error(
+        "{path}: the pose of view {view} {problem}; export the camera again as a rigid world-to-camera motion"
+    )]
     Pose {
         /// The file.
         path: PathBuf,
@@ -143,7 +145,9 @@ pub enum ClipError {
         tolerance: f64,
     },
     /// A model without cameras or images.
-    #[error("{path}: the model is empty: it has {cameras} cameras and {images} images; run the calibration again")]
+    #[error(
+        "{path}: the model is empty: it has {cameras} cameras and {images} images; run the calibration again"
+    )]
     EmptyModel {
         /// The file or folder.
         path: PathBuf,
@@ -177,7 +181,9 @@ pub enum ClipError {
         looked_for: PathBuf,
     },
     /// A frame that one view lacks and others have.
-    #[error("view {view} lacks frame {frame} (looked for {looked_for}); add the image, or choose frames that every view has")]
+    #[error(
+        "view {view} lacks frame {frame} (looked for {looked_for}); add the image, or choose frames that every view has"
+    )]
     MissingFrame {
         /// The view.
         view: String,
@@ -203,7 +209,9 @@ pub enum ClipError {
         path: PathBuf,
     },
     /// Frames were asked for that the clip lacks.
-    #[error("frames {first} to {last} were asked for, {root} has frames {available_first} to {available_last}; choose among these")]
+    #[error(
+        "frames {first} to {last} were asked for, {root} has frames {available_first} to {available_last}; choose among these"
+    )]
     FrameRange {
         /// The data set.
         root: PathBuf,
@@ -225,7 +233,9 @@ pub enum ClipError {
         known: String,
     },
     /// Nothing to triangulate from.
-    #[error("{root}: {training} of {views} views are for training, at least two are needed; hold out fewer views or add cameras")]
+    #[error(
+        "{root}: {training} of {views} views are for training, at least two are needed; hold out fewer views or add cameras"
+    )]
     TooFewTrainingViews {
         /// The data set.
         root: PathBuf,
@@ -268,7 +278,9 @@ pub enum ClipError {
         camera_height: u32,
     },
     /// Rows of `poses_bounds.npy` and cameras do not match.
-    #[error("{path} has {rows} rows for {cameras} cameras in {folder}; give one row per video or image folder, in the order of their names")]
+    #[error(
+        "{path} has {rows} rows for {cameras} cameras in {folder}; give one row per video or image folder, in the order of their names"
+    )]
     RowCount {
         /// The poses.
         path: PathBuf,
@@ -299,13 +311,17 @@ pub enum ClipError {
         message: String,
     },
     /// No folder for decoded videos was given.
-    #[error("{video} must be decoded to images, and no scratch folder was given; set `scratch` in the clip's options")]
+    #[error(
+        "{video} must be decoded to images, and no scratch folder was given; set `scratch` in the clip's options"
+    )]
     NoScratch {
         /// The video.
         video: PathBuf,
     },
     /// A view or frame index past the end.
-    #[error("there is no view {view} with frame index {frame}: the clip has {views} views and {frames} frames")]
+    #[error(
+        "there is no view {view} with frame index {frame}: the clip has {views} views and {frames} frames"
+    )]
     OutOfRange {
         /// View index.
         view: usize,

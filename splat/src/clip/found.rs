@@ -97,9 +97,10 @@ fn refuse_motion(
     let rotation = (known.rotation - camera.rotation).to_cols_array();
     let largest = |entries: &[f64]| entries.iter().fold(0.0, |worst: f64, entry| worst.max(entry.abs()));
     let width = f64::from(known.width);
-    let intrinsics =
-        [known.fx - camera.fx, known.fy - camera.fy, known.cx - camera.cx, known.cy - camera.cy].map(|change| change / width);
-    let size = [f64::from(known.width.abs_diff(camera.width)), f64::from(known.height.abs_diff(camera.height))];
+    let intrinsics = [known.fx - camera.fx, known.fy - camera.fy, known.cx - camera.cx, known.cy - camera.cy]
+        .map(|change| change / width);
+    let size =
+        [f64::from(known.width.abs_diff(camera.width)), f64::from(known.height.abs_diff(camera.height))];
     let coefficients = |d: &Distortion| [d.k1, d.k2, d.p1, d.p2];
     let (was, is) = (coefficients(&view.distortion), coefficients(distortion));
     let distortion_change: [f64; 4] = std::array::from_fn(|i| was[i] - is[i]);

@@ -24,7 +24,13 @@ pub(super) enum LensProblem {
 impl Lens {
     /// The lens of COLMAP's `model` with its parameters in COLMAP's order.
     pub(super) fn from_colmap(model: &str, parameters: &[f64]) -> Result<Self, LensProblem> {
-        let lens = |fx, fy, cx, cy, k1, k2, p1, p2| Self { fx, fy, cx, cy, distortion: Distortion { k1, k2, p1, p2 } };
+        let lens = |fx, fy, cx, cy, k1, k2, p1, p2| Self {
+            fx,
+            fy,
+            cx,
+            cy,
+            distortion: Distortion { k1, k2, p1, p2 },
+        };
         match (model, parameters) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => Ok(lens(f, f, cx, cy, 0.0, 0.0, 0.0, 0.0)),
             ("PINHOLE", &[fx, fy, cx, cy]) => Ok(lens(fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0)),

@@ -95,7 +95,9 @@ impl Cameras {
 
 fn pose_rows(path: &Path) -> Result<Vec<[f64; ROW]>, ClipError> {
     let file = File::open(path).map_err(ClipError::io(path))?;
-    let malformed = |found: String| ClipError::malformed(path, "array", found, "[cameras, 17] numbers of f64 or f32 in C order");
+    let malformed = |found: String| {
+        ClipError::malformed(path, "array", found, "[cameras, 17] numbers of f64 or f32 in C order")
+    };
     let npy = NpyFile::new(BufReader::new(file)).map_err(|error| malformed(error.to_string()))?;
     let (shape, order, dtype) = (npy.shape().to_vec(), npy.order(), npy.dtype());
     if !matches!(shape.as_slice(), &[_, columns] if columns == ROW as u64) || order != Order::C {
@@ -128,10 +130,15 @@ fn calibration(row: &[f64; ROW], path: &Path, view: &str) -> Result<(Lens, Pose,
     let pixels = |axis: &str, value: f64| {
         let valid = value.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&value);
         // The range check makes the conversion exact.
-        if valid { Ok(value as u32) } else { Err(ClipError::malformed(path, format!("{axis} of {view}"), value, "a number of pixels")) }
+        if valid {
+            Ok(value as u32)
+        } else {
+            Err(ClipError::malformed(path, format!("{axis} of {view}"), value, "a number of pixels"))
+        }
     };
     let size = [pixels("width", width)?, pixels("height", height)?];
-    let lens = Lens { fx: focal, fy: focal, cx: width / 2.0, cy: height / 2.0, distortion: Distortion::default() };
+    let lens =
+        Lens { fx: focal, fy: focal, cx: width / 2.0, cy: height / 2.0, distortion: Distortion::default() };
     Ok((lens, pose, size))
 }
 
@@ -160,7 +167,12 @@ impl Splits {
         }
         let text = fs::read(&path).map_err(ClipError::io(&path))?;
         let file: CamerasFile = serde_json::from_slice(&text).map_err(|error| {
-            ClipError::malformed(&path, "JSON", error, "cameras with a name and, if wanted, a split of train or test")
+            ClipError::malformed(
+                &path,
+                "JSON",
+                error,
+                "cameras with a name and, if wanted, a split of train or test",
+            )
         })?;
         let splits: BTreeMap<String, Split> =
             file.cameras.into_iter().filter_map(|camera| Some((camera.name, camera.split?))).collect();
@@ -172,10 +184,9 @@ impl Splits {
         let Some((path, splits)) = &self.stated else {
             return Ok(if index == 0 { Split::Test } else { Split::Train });
         };
-        splits
-            .get(name)
-            .copied()
-            .ok_or_else(|| ClipError::malformed(path, "cameras", format!("no split for {name}"), "one for every camera"))
+        splits.get(name).copied().ok_or_else(|| {
+            ClipError::malformed(path, "cameras", format!("no split for {name}"), "one for every camera")
+        })
     }
 }
 

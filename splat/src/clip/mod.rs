@@ -219,7 +219,7 @@ impl Clip {
     }
 
     /// BLAKE3 in hexadecimal of what was opened: cameras, view names, splits, frame numbers, points and the bytes
-    /// of every image and mask. Equal for equal content, wherever the folder is and whichever layout stated it.
+    /// of every image and mask. Equal for equal content, wherever the folder is and whatever its files are called.
     ///
     /// Reads every file once.
     pub fn digest(&self) -> Result<String, ClipError> {
@@ -263,5 +263,7 @@ fn read(path: &Path) -> Result<Vec<u8>, ClipError> {
     fs::read(path).map_err(ClipError::io(path))
 }
 
+#[cfg(test)]
+mod testing;
 #[cfg(test)]
 mod tests;

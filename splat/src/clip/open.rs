@@ -72,7 +72,11 @@ pub(super) fn detect(root: &Path, options: &ClipOptions) -> Result<Found, ClipEr
 }
 
 /// Checks the views as a whole and chooses the frames.
-pub(super) fn check(root: &Path, mut found: Vec<FoundView>, options: &ClipOptions) -> Result<Opened, ClipError> {
+pub(super) fn check(
+    root: &Path,
+    mut found: Vec<FoundView>,
+    options: &ClipOptions,
+) -> Result<Opened, ClipError> {
     found.sort_by(|a, b| a.name.cmp(&b.name));
     refuse_duplicates(&found)?;
     hold_out(&mut found, &options.test_views)?;
@@ -84,7 +88,8 @@ pub(super) fn check(root: &Path, mut found: Vec<FoundView>, options: &ClipOption
     let frames = choose_frames(root, &found, options.frames)?;
     let sources = sources(root, &found, &frames)?;
     check_sizes(&found, &sources)?;
-    let views = found.into_iter().map(|view| View { name: view.name, camera: view.camera, split: view.split });
+    let views =
+        found.into_iter().map(|view| View { name: view.name, camera: view.camera, split: view.split });
     Ok(Opened { views: views.collect(), sources, frames })
 }
 
@@ -165,7 +170,13 @@ fn choose_frames(root: &Path, views: &[FoundView], range: Option<(u32, u32)>) ->
     let chosen: Vec<u32> = available.into_iter().filter(|frame| (first..=last).contains(frame)).collect();
     let outside = first < available_first || last > available_last || chosen.is_empty();
     if outside {
-        return Err(ClipError::FrameRange { root: root.to_owned(), first, last, available_first, available_last });
+        return Err(ClipError::FrameRange {
+            root: root.to_owned(),
+            first,
+            last,
+            available_first,
+            available_last,
+        });
     }
     Ok(chosen)
 }
@@ -203,7 +214,8 @@ fn image_of(view: &FoundView, frame: u32) -> Result<PathBuf, ClipError> {
 /// `masks/<view>/<stem>.png`, or `masks/<stem>.png` where every image is a view.
 fn mask_of(masks: &Path, view: &str, image: &Path) -> Option<PathBuf> {
     let file = format!("{}.png", stem_of(image));
-    let candidates = [Some(masks.join(view).join(&file)), (stem_of(image) == view).then(|| masks.join(&file))];
+    let candidates =
+        [Some(masks.join(view).join(&file)), (stem_of(image) == view).then(|| masks.join(&file))];
     candidates.into_iter().flatten().find(|path| path.is_file())
 }
 

@@ -113,6 +113,9 @@ mod tests {
         assert_eq!(far, Err(PoseProblem::NotFinite));
         assert_eq!(Pose::from_colmap([0.0; 4], [0.0; 3]), Err(PoseProblem::ZeroQuaternion));
         assert_eq!(Pose::from_colmap([1.0, 0.0, 0.0, f64::NAN], [0.0; 3]), Err(PoseProblem::NotFinite));
-        assert_eq!(Pose::from_colmap([1.0, 0.0, 0.0, 0.0], [0.0, f64::INFINITY, 0.0]), Err(PoseProblem::NotFinite));
+        assert_eq!(
+            Pose::from_colmap([1.0, 0.0, 0.0, 0.0], [0.0, f64::INFINITY, 0.0]),
+            Err(PoseProblem::NotFinite)
+        );
     }
 }

@@ -62,7 +62,10 @@ impl Decoder<'_> {
         let output = match output {
             Ok(output) => output,
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                return Err(ClipError::NoFfmpeg { video: video.to_owned(), program: self.program.to_owned() });
+                return Err(ClipError::NoFfmpeg {
+                    video: video.to_owned(),
+                    program: self.program.to_owned(),
+                });
             }
             Err(error) => return Err(ClipError::io(self.program)(error)),
         };
@@ -84,9 +87,22 @@ fn arguments(video: &Path, frames: Option<(u32, u32)>) -> Vec<OsString> {
     let start = frames.map_or(1, |(first, _)| first.max(1)).to_string();
     let mut input = OsString::from("file:");
     input.push(video);
-    let mut arguments: Vec<OsString> = ["-nostdin", "-hide_banner", "-loglevel", "error", "-i"].map(OsString::from).into();
+    let mut arguments: Vec<OsString> =
+        ["-nostdin", "-hide_banner", "-loglevel", "error", "-i"].map(OsString::from).into();
     arguments.push(input);
-    let output = ["-map", "0:v:0", "-vf", &filter, "-r", "25", "-pix_fmt", "rgb24", "-start_number", &start, "frame_%05d.png"];
+    let output = [
+        "-map",
+        "0:v:0",
+        "-vf",
+        &filter,
+        "-r",
+        "25",
+        "-pix_fmt",
+        "rgb24",
+        "-start_number",
+        &start,
+        "frame_%05d.png",
+    ];
     arguments.extend(output.map(OsString::from));
     arguments
 }
@@ -121,7 +137,10 @@ pub(super) mod tests {
         assert!(joined(None).contains("-i file:/a b/cam00.mp4 -map 0:v:0 -vf settb=1/25,setpts=N -r 25"));
         assert!(joined(None).contains("-start_number 1 frame_%05d.png"));
         let some = joined(Some((3, 7)));
-        assert!(some.contains("-vf select='between(n,2,6)',settb=1/25,setpts=N") && some.contains("-start_number 3"));
+        assert!(
+            some.contains("-vf select='between(n,2,6)',settb=1/25,setpts=N")
+                && some.contains("-start_number 3")
+        );
     }
 
     /// Whether this machine has an ffmpeg that runs; tests that need one say so and stop otherwise.
@@ -131,9 +150,23 @@ pub(super) mod tests {
 
     /// A 64x48 video whose frame `n` (from 1) is grey of about `20 n`.
     pub(in crate::clip) fn write_video(path: &Path, frames: u32) {
-        let source = format!("color=c=black:s=64x48:r=30,geq=lum='16+20*(N+1)*219/255':cb=128:cr=128,trim=end_frame={frames}");
+        let source = format!(
+            "color=c=black:s=64x48:r=30,geq=lum='16+20*(N+1)*219/255':cb=128:cr=128,trim=end_frame={frames}"
+        );
         let made = Command::new("ffmpeg")
-            .args(["-nostdin", "-loglevel", "error", "-f", "lavfi", "-i", &source, "-c:v", "mpeg4", "-q:v", "1"])
+            .args([
+                "-nostdin",
+                "-loglevel",
+                "error",
+                "-f",
+                "lavfi",
+                "-i",
+                &source,
+                "-c:v",
+                "mpeg4",
+                "-q:v",
+                "1",
+            ])
             .arg(path)
             .output()
             .expect("ffmpeg runs");
@@ -168,7 +201,9 @@ pub(super) mod tests {
         }
         let broken = folder.path().join("broken.mp4");
         fs::write(&broken, b"no video").expect("a file");
-        let error = Decoder { program: "ffmpeg", scratch: &scratch, frames: None }.decode(&broken).expect_err("no video");
+        let error = Decoder { program: "ffmpeg", scratch: &scratch, frames: None }
+            .decode(&broken)
+            .expect_err("no video");
         assert!(matches!(&error, ClipError::Ffmpeg { video, .. } if *video == broken), "{error}");
     }
 }

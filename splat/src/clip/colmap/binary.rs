@@ -50,7 +50,12 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, ModelCamera>, ClipErr
         let parameters = (0..parameter_count).map(|_| input.f64()).collect::<Result<_, _>>()?;
         let camera = ModelCamera { model: name.to_owned(), width, height, parameters };
         if cameras.insert(id, camera).is_some() {
-            return Err(ClipError::malformed(path, "camera id", format!("{id} again"), "one record per camera"));
+            return Err(ClipError::malformed(
+                path,
+                "camera id",
+                format!("{id} again"),
+                "one record per camera",
+            ));
         }
     }
     Ok(cameras)

@@ -56,7 +56,11 @@ pub(super) fn read(root: &Path) -> Option<Result<Found, ClipError>> {
     Some(read_data_set(root, &training, model_files(root, "sparse_test").as_ref()))
 }
 
-fn read_data_set(root: &Path, training: &ModelFiles, held_out: Option<&ModelFiles>) -> Result<Found, ClipError> {
+fn read_data_set(
+    root: &Path,
+    training: &ModelFiles,
+    held_out: Option<&ModelFiles>,
+) -> Result<Found, ClipError> {
     let model = read_model(training)?;
     let mut views = views_of(root, training, &model, Split::Train)?;
     if let Some(files) = held_out {
@@ -95,13 +99,22 @@ fn read_model(files: &ModelFiles) -> Result<Model, ClipError> {
     };
     if cameras.is_empty() || images.is_empty() {
         let path = if images.is_empty() { &files.images } else { &files.cameras };
-        return Err(ClipError::EmptyModel { path: path.clone(), cameras: cameras.len(), images: images.len() });
+        return Err(ClipError::EmptyModel {
+            path: path.clone(),
+            cameras: cameras.len(),
+            images: images.len(),
+        });
     }
     Ok(Model { cameras, images, points })
 }
 
 /// Views of a model: one per image folder with all frames in it, or one per image if no image lies in a folder.
-fn views_of(root: &Path, files: &ModelFiles, model: &Model, split: Split) -> Result<Vec<FoundView>, ClipError> {
+fn views_of(
+    root: &Path,
+    files: &ModelFiles,
+    model: &Model,
+    split: Split,
+) -> Result<Vec<FoundView>, ClipError> {
     let image_root = root.join("images");
     let in_folders = model.images.iter().filter(|image| !folder_of(&image.name).is_empty()).count();
     if in_folders == 0 {

@@ -27,7 +27,12 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, ModelCamera>, ClipErr
             parameters: fields.rest("PARAMS")?,
         };
         if cameras.insert(id, camera).is_some() {
-            return Err(ClipError::malformed(path, lines.place(), format!("camera {id} again"), "one line per camera"));
+            return Err(ClipError::malformed(
+                path,
+                lines.place(),
+                format!("camera {id} again"),
+                "one line per camera",
+            ));
         }
     }
     Ok(cameras)
@@ -127,13 +132,23 @@ impl Fields<'_> {
     fn parse<T: FromStr>(&self, name: &str, word: &str) -> Result<T, ClipError> {
         let number = std::any::type_name::<T>();
         word.parse().map_err(|_| {
-            ClipError::malformed(self.path, format!("line {}, {name}", self.line), format!("`{word}`"), format!("a {number}"))
+            ClipError::malformed(
+                self.path,
+                format!("line {}, {name}", self.line),
+                format!("`{word}`"),
+                format!("a {number}"),
+            )
         })
     }
 
     fn next<T: FromStr>(&mut self, name: &str) -> Result<T, ClipError> {
         let Some(word) = self.words.next() else {
-            return Err(ClipError::malformed(self.path, format!("line {}", self.line), "the end of the line", name));
+            return Err(ClipError::malformed(
+                self.path,
+                format!("line {}", self.line),
+                "the end of the line",
+                name,
+            ));
         };
         self.parse(name, word)
     }

@@ -124,7 +124,13 @@ impl Transforms {
     }
 
     /// The view of an entry, holding the entry's image as `frame`.
-    pub(super) fn view(&self, entry: &Entry, name: String, split: Split, frame: u32) -> Result<FoundView, ClipError> {
+    pub(super) fn view(
+        &self,
+        entry: &Entry,
+        name: String,
+        split: Split,
+        frame: u32,
+    ) -> Result<FoundView, ClipError> {
         let image = self.image(entry);
         let calibration = Merged { own: &entry.calibration, shared: &self.file.calibration };
         calibration.refuse_other_models(&self.path, &name)?;
@@ -155,7 +161,9 @@ impl Transforms {
         };
         let whole = |axis: &str, pixels: f64| {
             let valid = pixels.fract() == 0.0 && (1.0..=f64::from(u32::MAX)).contains(&pixels);
-            let error = || ClipError::malformed(&self.path, format!("{axis} of {view}"), pixels, "a number of pixels");
+            let error = || {
+                ClipError::malformed(&self.path, format!("{axis} of {view}"), pixels, "a number of pixels")
+            };
             // The range check makes the conversion exact.
             if valid { Ok(pixels as u32) } else { Err(error()) }
         };
@@ -169,7 +177,12 @@ impl Transforms {
         if !complete {
             let lengths: Vec<usize> = rows.iter().map(Vec::len).collect();
             let place = format!("transform_matrix of {view}");
-            return Err(ClipError::malformed(&self.path, place, format!("rows of {lengths:?}"), "4x4 or 3x4 numbers"));
+            return Err(ClipError::malformed(
+                &self.path,
+                place,
+                format!("rows of {lengths:?}"),
+                "4x4 or 3x4 numbers",
+            ));
         }
         let column = |index: usize| DVec3::new(rows[0][index], rows[1][index], rows[2][index]);
         let axes = DMat3::from_cols(column(0), column(1), column(2));

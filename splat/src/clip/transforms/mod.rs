@@ -92,7 +92,9 @@ fn found(root: &Path, sightings: Vec<FoundView>, files: &[Transforms]) -> Result
 /// The points a file names, or those that lie beside the files under a usual name.
 fn initial_points(root: &Path, files: &[Transforms]) -> Result<Vec<SfmPoint>, ClipError> {
     let named = files.iter().find_map(Transforms::points);
-    let usual = || ["points3D.ply", "sparse_pc.ply"].map(|name| root.join(name)).into_iter().find(|path| path.is_file());
+    let usual = || {
+        ["points3D.ply", "sparse_pc.ply"].map(|name| root.join(name)).into_iter().find(|path| path.is_file())
+    };
     named.or_else(usual).map_or_else(|| Ok(Vec::new()), |path| points_ply::read(&path))
 }
 
