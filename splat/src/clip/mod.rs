@@ -181,7 +181,10 @@ impl Clip {
             return Ok(None);
         };
         let stored = self.decode_mask(view, path, &read(path)?)?;
-        let mask = Arc::new(source.lens.map().map_or_else(|| stored.clone(), |map| map.mask(&stored)));
+        let mask = Arc::new(match source.lens.map() {
+            Some(map) => map.mask(&stored),
+            None => stored,
+        });
         self.content.cache.keep_mask((view, frame), &mask);
         Ok(Some(mask))
     }

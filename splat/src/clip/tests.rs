@@ -3,7 +3,7 @@
 use std::{fs, thread};
 
 use super::{
-    testing::{Synthetic, assert_same_content, same_camera},
+    testing::{Synthetic, assert_same_content, same_camera, skip},
     *,
 };
 
@@ -303,7 +303,7 @@ fn shared() -> Option<PathBuf> {
 fn the_shared_clips_say_the_same_in_every_layout() {
     use std::os::unix::fs::symlink;
     let Some(clips) = shared().map(|shared| shared.join("clips")) else {
-        eprintln!("skipped: no shared clips beside the workspace");
+        skip("no shared clips beside the workspace");
         return;
     };
     let root = clips.join("dev-slide");
@@ -347,7 +347,7 @@ fn the_shared_clips_say_the_same_in_every_layout() {
 fn points_project_onto_their_own_colour() {
     // Right axes and pixel centres in one: the exact points of the shared clip carry the colour of the surface.
     let Some(root) = shared().map(|shared| shared.join("clips/dev-slide")) else {
-        eprintln!("skipped: no shared clips beside the workspace");
+        skip("no shared clips beside the workspace");
         return;
     };
     let clip = Clip::open(&root, &ClipOptions::default()).unwrap();
@@ -375,7 +375,7 @@ fn points_project_onto_their_own_colour() {
 #[test]
 fn real_data_opens() {
     let Some(real) = shared().map(|shared| shared.join("real")) else {
-        eprintln!("skipped: no shared data beside the workspace");
+        skip("no shared data beside the workspace");
         return;
     };
     let rats = Clip::open(&real.join("dannce"), &ClipOptions::default()).unwrap();

@@ -3,7 +3,7 @@
 use super::*;
 use crate::clip::{
     Clip,
-    testing::{Synthetic, assert_same_content, write_npy},
+    testing::{Synthetic, assert_same_content, skip, write_npy},
     video::tests::{has_ffmpeg, write_video},
 };
 
@@ -130,7 +130,7 @@ fn videos_need_a_scratch_folder() {
 #[test]
 fn videos_become_frames() {
     if !has_ffmpeg() {
-        eprintln!("skipped: no ffmpeg on the PATH");
+        skip("no ffmpeg on the PATH");
         return;
     }
     let clip = llff();
