@@ -11,7 +11,7 @@ use crate::static_model::SfmPoint;
 /// Changes whenever the same files would give other images, cameras or points.
 const FORMAT: &str = "trackersplat clip 1";
 
-/// BLAKE3 of everything a clip's content decides; equal whatever the folder is called or the layout is.
+/// BLAKE3 of cameras, splits, frame numbers, points and file contents, each preceded by its length or count.
 pub(super) fn clip(
     views: &[View],
     sources: &[Source],

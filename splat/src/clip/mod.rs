@@ -181,7 +181,10 @@ impl Clip {
             return Ok(None);
         };
         let stored = self.decode_mask(view, path, &read(path)?)?;
-        let mask = Arc::new(source.lens.map().map_or_else(|| stored.clone(), |map| map.mask(&stored)));
+        let mask = Arc::new(match source.lens.map() {
+            Some(map) => map.mask(&stored),
+            None => stored,
+        });
         self.content.cache.keep_mask((view, frame), &mask);
         Ok(Some(mask))
     }
@@ -219,7 +222,7 @@ impl Clip {
     }
 
     /// BLAKE3 in hexadecimal of what was opened: cameras, view names, splits, frame numbers, points and the bytes
-    /// of every image and mask. Equal for equal content, wherever the folder is and whichever layout stated it.
+    /// of every image and mask. Equal for equal content, wherever the folder is and whatever its files are called.
     ///
     /// Reads every file once.
     pub fn digest(&self) -> Result<String, ClipError> {
@@ -263,5 +266,7 @@ fn read(path: &Path) -> Result<Vec<u8>, ClipError> {
     fs::read(path).map_err(ClipError::io(path))
 }
 
+#[cfg(test)]
+mod testing;
 #[cfg(test)]
 mod tests;

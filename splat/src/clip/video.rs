@@ -110,7 +110,7 @@ fn arguments(video: &Path, frames: Option<(u32, u32)>) -> Vec<OsString> {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::clip::frame_files::numbered_images;
+    use crate::clip::{frame_files::numbered_images, testing::skip};
 
     #[test]
     fn a_missing_ffmpeg_is_explained() {
@@ -176,7 +176,7 @@ pub(super) mod tests {
     #[test]
     fn frames_are_neither_dropped_nor_doubled() {
         if !has_ffmpeg() {
-            eprintln!("skipped: no ffmpeg on the PATH");
+            skip("no ffmpeg on the PATH");
             return;
         }
         let folder = tempfile::tempdir().expect("a folder");
