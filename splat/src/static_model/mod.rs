@@ -121,7 +121,7 @@ fn initial(
     }
     let stride = points.len().div_ceil(settings.max_gaussians.max(1));
     let thinned: Vec<SfmPoint> = points.iter().step_by(stride).copied().collect();
-    Ok(init::from_points(&thinned, settings.sh_degree))
+    Ok(init::from_points(&thinned, settings.sh_degree_for(input.views.len())))
 }
 
 struct Optimisation<'a> {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::settings::Quality;
+use crate::{gaussians::sh, settings::Quality};
 
 /// Settings of the static model. Rates and thresholds are those of 3D Gaussian Splatting (Kerbl et al. 2023, section 5
 /// and 7.1) unless stated otherwise, on a schedule short enough for a frame of a clip.
@@ -17,6 +17,9 @@ pub struct StaticModelSettings {
     pub random_points: usize,
     /// Highest spherical-harmonic degree, 0 to 3.
     pub sh_degree: u32,
+    /// Training views that each spherical-harmonic coefficient needs: the degree is lowered until there are enough, as
+    /// colours that a few views leave undetermined are wrong from every other side. 0 asks for none.
+    pub sh_views_per_coefficient: u32,
     /// Steps after which the degree is raised by one.
     pub sh_degree_interval: u32,
     /// Weight of the structural term in the loss, 0 to 1.
@@ -55,6 +58,14 @@ pub struct StaticModelSettings {
     pub plateau_improvement: f32,
 }
 
+impl StaticModelSettings {
+    /// The spherical-harmonic degree that `views` training views determine.
+    pub fn sh_degree_for(&self, views: usize) -> u32 {
+        let needed = |degree| sh::coefficients(degree) * self.sh_views_per_coefficient as usize;
+        (0..=self.sh_degree.min(sh::MAX_DEGREE)).rev().find(|&degree| needed(degree) <= views).unwrap_or(0)
+    }
+}
+
 impl Default for StaticModelSettings {
     fn default() -> Self {
         Self::preset(Quality::default())
@@ -74,12 +85,13 @@ impl StaticModelSettings {
             max_gaussians,
             random_points: 10_000,
             sh_degree: 3,
+            sh_views_per_coefficient: 2,
             sh_degree_interval: max_steps / 6,
             dssim_weight: 0.2,
             densify_from: 200,
             densify_until: 0.6,
             densify_interval: 100,
-            densify_gradient: 2e-4,
+            densify_gradient: 3e-4,
             split_extent: 0.01,
             prune_opacity: 0.005,
             prune_extent: 0.1,
