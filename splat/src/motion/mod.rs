@@ -1,28 +1,49 @@
 //! Motion compensation: footprint moments → 2D motion → lift to 3D → regularised field.
+//!
+//! | step | file |
+//! |---|---|
+//! | affine motion of each footprint, with its uncertainty | `fit2d` |
+//! | which views see a Gaussian, and how well | `observe` |
+//! | Gaussians at rest | `static_test` |
+//! | new positions, robust to wrong views | `lift` |
+//! | rotations from neighbours and from the footprints' deformation | `rotation` |
+//! | motion of unobserved Gaussians from agreeing neighbours | `propagate` |
+//! | the neighbours' field as one sparse solve | `regularize` |
+//! | moving the Gaussians | `apply` |
+//!
+//! Solves run in double precision; sums are in index order, so that the result does not depend on the number of threads.
 
+mod apply;
+mod fit2d;
+mod lift;
+mod linear;
 pub mod moments;
+mod neighbours;
+mod observe;
+mod propagate;
+mod regularize;
+mod rotation;
+mod settings;
+mod static_test;
+#[cfg(test)]
+mod tests;
 
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::settings::Quality;
+pub use apply::apply;
+pub use settings::MotionSettings;
 
-/// How Gaussians are moved from tracks.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct MotionSettings {}
-
-impl Default for MotionSettings {
-    fn default() -> Self {
-        Self::preset(Quality::default())
-    }
-}
-
-impl MotionSettings {
-    /// The settings of a quality level.
-    pub fn preset(_quality: Quality) -> Self {
-        Self {}
-    }
-}
+use crate::{
+    engine::{Engine, EngineError},
+    gaussians::Gaussians,
+};
+use lift::Sighting;
+use neighbours::Neighbourhood;
+use observe::Observation;
+use propagate::{Context, State};
+use rotation::{Deformation, Member};
 
 /// How a Gaussian's motion was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -61,16 +82,119 @@ pub struct MotionView {
 }
 
 /// Motion of every Gaussian of the static model to the frame that the tracks lead to.
+///
+/// # Errors
+/// [`EngineError::InvalidInput`] if tracks and camera of a view differ in size; otherwise whatever the engine reports.
 pub fn estimate(
-    _engine: &dyn crate::engine::Engine,
-    _gaussians: &crate::gaussians::Gaussians,
-    _views: &[MotionView],
-    _settings: &MotionSettings,
-) -> Result<MotionField, crate::engine::EngineError> {
-    unimplemented!("lands with the motion commit")
+    engine: &dyn Engine,
+    gaussians: &Gaussians,
+    views: &[MotionView],
+    settings: &MotionSettings,
+) -> Result<MotionField, EngineError> {
+    let observations = observe::observe(engine, gaussians, views, settings)?;
+    let neighbourhood = Neighbourhood::new(gaussians, settings)?;
+    let context = Context { gaussians, neighbourhood: &neighbourhood, settings };
+    let mut states: Vec<State> = observations
+        .par_iter()
+        .enumerate()
+        .map(|(index, observations)| solve_alone(gaussians.mean(index), observations, views, settings))
+        .collect();
+    propagate::retract_unverified(&mut states, &context);
+    turn_solved(&mut states, &observations, views, &context);
+    propagate::propagate(&mut states, &context);
+    regularize::regularize(&mut states, &context);
+    Ok(field(gaussians, &states, &observations, views))
 }
 
-/// The Gaussians after a motion: means moved, rotations composed, spherical harmonics rotated with them.
-pub fn apply(_gaussians: &crate::gaussians::Gaussians, _field: &MotionField) -> crate::gaussians::Gaussians {
-    unimplemented!("lands with the motion commit")
+/// What a Gaussian's own footprints say about its translation.
+fn solve_alone(
+    mean: DVec3,
+    observations: &[Observation],
+    views: &[MotionView],
+    settings: &MotionSettings,
+) -> State {
+    if static_test::is_at_rest(observations, settings) {
+        return State::unmoved(MotionOrigin::Static, None);
+    }
+    let sightings: Vec<Sighting<'_>> = observations
+        .iter()
+        .map(|o| Sighting { camera: &views[o.view].camera, pixel: o.fit.target, variance: o.fit.variance })
+        .collect();
+    let Some(lift) = lift::solve(&sightings, mean, settings) else {
+        return State::unmoved(MotionOrigin::Unsolved, None);
+    };
+    if !lift.is_determined {
+        return State::unmoved(MotionOrigin::Unsolved, Some(lift));
+    }
+    State { translation: lift.translation, own: Some(lift), ..State::unmoved(MotionOrigin::Solved, None) }
+}
+
+/// Rotations of the solved Gaussians, from solved neighbours and their own footprints' deformation.
+fn turn_solved(
+    states: &mut [State],
+    observations: &[Vec<Observation>],
+    views: &[MotionView],
+    context: &Context<'_>,
+) {
+    let snapshot: &[State] = states;
+    let rotations: Vec<_> = (0..snapshot.len())
+        .into_par_iter()
+        .filter_map(|index| {
+            let state = &snapshot[index];
+            let own = state.own.as_ref().filter(|_| state.origin == MotionOrigin::Solved)?;
+            let neighbours = context.neighbourhood.nearest[index].iter().filter_map(|n| {
+                let other = &snapshot[n.index];
+                let lift = other.own.as_ref().filter(|_| other.origin == MotionOrigin::Solved)?;
+                Some(context.member(index, n.index, n.affinity, other, lift.information))
+            });
+            let itself = context.member(index, index, 1.0, state, own.information);
+            let members: Vec<Member> = std::iter::once(itself).chain(neighbours).collect();
+            let deformations: Vec<Deformation<'_>> = own
+                .inliers
+                .iter()
+                .map(|&k| &observations[index][k])
+                .map(|o| Deformation { camera: &views[o.view].camera, fit: &o.fit })
+                .collect();
+            let axes = rotation::lift_axes(context.gaussians, index, own.translation, &deformations);
+            let spacing = context.neighbourhood.spacing;
+            let motion =
+                rotation::fit_rigid_motion(&members, &axes, own.translation, spacing, context.settings);
+            Some((index, motion.rotation))
+        })
+        .collect();
+    for (index, rotation) in rotations {
+        states[index].rotation = rotation;
+    }
+}
+
+fn field(
+    gaussians: &Gaussians,
+    states: &[State],
+    observations: &[Vec<Observation>],
+    views: &[MotionView],
+) -> MotionField {
+    let information = |index: usize| match &states[index].own {
+        Some(own) => own.information,
+        None if states[index].origin == MotionOrigin::Static => {
+            resting_information(gaussians.mean(index), &observations[index], views)
+        }
+        None => DMat3::ZERO,
+    };
+    MotionField {
+        translation: states.iter().map(|state| state.translation).collect(),
+        rotation: states.iter().map(|state| state.rotation).collect(),
+        origin: states.iter().map(|state| state.origin).collect(),
+        information: (0..states.len()).into_par_iter().map(information).collect(),
+    }
+}
+
+/// `Σ TᵀT / σ²` at a mean that stays.
+fn resting_information(mean: DVec3, observations: &[Observation], views: &[MotionView]) -> DMat3 {
+    let mut information = DMat3::ZERO;
+    for Observation { view, fit, .. } in observations {
+        let camera = &views[*view].camera;
+        let [u, v] = camera.world_jacobian(camera.to_camera(mean));
+        information += (linear::outer(u, u) + linear::outer(v, v)) * fit.variance.recip();
+    }
+    information
 }

@@ -1,0 +1,208 @@
+//! Motion for the Gaussians that the tracks do not determine, from those that they do.
+
+use glam::{DMat3, DQuat, DVec3};
+use rayon::prelude::*;
+
+use super::{
+    MotionOrigin, MotionSettings,
+    lift::Lift,
+    neighbours::{Neighbour, Neighbourhood},
+    rotation::{Member, RigidMotion, fit_rigid_motion},
+};
+use crate::gaussians::Gaussians;
+
+/// What is known of one Gaussian's motion so far.
+#[derive(Clone, Debug)]
+pub(super) struct State {
+    pub origin: MotionOrigin,
+    pub translation: DVec3,
+    pub rotation: DQuat,
+    /// What its own footprints say: of a solved Gaussian everything, of another the directions that were seen.
+    pub own: Option<Lift>,
+}
+
+impl State {
+    /// Neither moved nor turned.
+    pub(super) fn unmoved(origin: MotionOrigin, own: Option<Lift>) -> Self {
+        Self { origin, translation: DVec3::ZERO, rotation: DQuat::IDENTITY, own }
+    }
+
+    fn is_known(&self) -> bool {
+        self.origin != MotionOrigin::Unsolved
+    }
+}
+
+/// What a Gaussian's neighbourhood is measured with.
+pub(super) struct Context<'a> {
+    pub gaussians: &'a Gaussians,
+    pub neighbourhood: &'a Neighbourhood,
+    pub settings: &'a MotionSettings,
+}
+
+impl Context<'_> {
+    /// Information about a motion that was not measured: it is known to the strain of a neighbourhood.
+    fn indirect_information(&self) -> DMat3 {
+        let deviation = self.settings.neighbour_strain * self.neighbourhood.spacing;
+        DMat3::from_diagonal(DVec3::splat(deviation.max(1e-150).powi(-2)))
+    }
+
+    pub(super) fn member(
+        &self,
+        centre: usize,
+        index: usize,
+        affinity: f64,
+        state: &State,
+        information: DMat3,
+    ) -> Member {
+        Member {
+            offset: self.gaussians.mean(index) - self.gaussians.mean(centre),
+            translation: state.translation,
+            information,
+            affinity,
+        }
+    }
+
+    /// The neighbours of known motion that move most alike, and the motion in their middle.
+    fn consensus(&self, centre: usize, states: &[State]) -> Option<Consensus> {
+        let list = &self.neighbourhood.nearest[centre];
+        let known: Vec<Neighbour> = list.iter().copied().filter(|n| states[n.index].is_known()).collect();
+        let mean = |index: usize| self.gaussians.mean(index);
+        let carried = |n: &Neighbour| {
+            // What the neighbour's rigid motion would do at the centre.
+            let state = &states[n.index];
+            let lever = mean(centre) - mean(n.index);
+            state.translation + state.rotation * lever - lever
+        };
+        let agree = |a: &Neighbour, b: &Neighbour| {
+            let tolerance = 2.0 * self.settings.neighbour_strain * (a.distance + b.distance)
+                + 0.1 * self.neighbourhood.spacing;
+            (carried(a) - carried(b)).length() <= tolerance
+        };
+        let support = |candidate: &Neighbour| -> f64 {
+            known.iter().filter(|other| agree(candidate, other)).map(|other| other.affinity).sum()
+        };
+        let mut best: Option<(f64, &Neighbour)> = None;
+        for candidate in &known {
+            let support = support(candidate);
+            // Nearest first, so that a tie goes to the nearer.
+            if best.is_none_or(|(most, _)| support > most) {
+                best = Some((support, candidate));
+            }
+        }
+        let (_, leader) = best?;
+        let members: Vec<Neighbour> = known.iter().copied().filter(|other| agree(leader, other)).collect();
+        Some(Consensus { translation: carried(leader), known: known.len(), members })
+    }
+}
+
+struct Consensus {
+    /// Displacement of the centre by its best supported neighbour.
+    translation: DVec3,
+    /// Neighbours of known motion.
+    known: usize,
+    /// Those of them that agree.
+    members: Vec<Neighbour>,
+}
+
+/// Takes back solutions that only two views support and that a majority of the neighbours contradicts: a track
+/// that is wrong along the epipolar line passes every test of its own.
+pub(super) fn retract_unverified(states: &mut [State], context: &Context<'_>) {
+    let snapshot: &[State] = states;
+    let retracted: Vec<usize> = (0..snapshot.len())
+        .into_par_iter()
+        .filter(|&index| {
+            let state = &snapshot[index];
+            let is_unverified = state.origin == MotionOrigin::Solved
+                && state.own.as_ref().is_some_and(|own| own.inliers.len() < 3);
+            if !is_unverified {
+                return false;
+            }
+            let Some(consensus) = context.consensus(index, snapshot) else { return false };
+            let farthest = consensus.members.last().map_or(0.0, |member| member.distance);
+            let tolerance = 4.0 * context.settings.neighbour_strain * farthest
+                + 0.1 * context.neighbourhood.spacing
+                + deviation(state);
+            2 * consensus.members.len() > consensus.known
+                && consensus.members.len() >= context.settings.min_support
+                && (state.translation - consensus.translation).length() > tolerance
+        })
+        .collect();
+    for index in retracted {
+        states[index] = State::unmoved(MotionOrigin::Unsolved, None);
+    }
+}
+
+/// Three standard deviations of a solved translation in its worst direction, bounded from above.
+fn deviation(state: &State) -> f64 {
+    let Some(own) = &state.own else { return 0.0 };
+    let covariance = own.information.inverse();
+    let trace = covariance.x_axis.x + covariance.y_axis.y + covariance.z_axis.z;
+    if trace.is_finite() { 3.0 * trace.max(0.0).sqrt() } else { 0.0 }
+}
+
+/// Fills unsolved Gaussians from agreeing neighbours, one ring of neighbours per hop.
+///
+/// Each hop reads the states before it, so that the result does not depend on the order of the Gaussians. Where too few
+/// neighbours agree the Gaussian stays unsolved.
+pub(super) fn propagate(states: &mut [State], context: &Context<'_>) {
+    for _ in 0..context.settings.max_hops {
+        let snapshot: &[State] = states;
+        let filled: Vec<(usize, State)> = (0..snapshot.len())
+            .into_par_iter()
+            .filter(|&index| !snapshot[index].is_known())
+            .filter_map(|index| Some((index, follow_neighbours(index, snapshot, context)?)))
+            .collect();
+        if filled.is_empty() {
+            return;
+        }
+        for (index, state) in filled {
+            states[index] = state;
+        }
+    }
+}
+
+fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> Option<State> {
+    let consensus = context.consensus(index, states)?;
+    if consensus.members.len() < context.settings.min_support.max(1) {
+        return None;
+    }
+    let are_at_rest = consensus.members.iter().all(|n| states[n.index].origin == MotionOrigin::Static);
+    let own = states[index].own.clone().filter(|own| agrees(own, consensus.translation, context.settings));
+    if are_at_rest && states[index].own.is_none() {
+        return Some(State::unmoved(MotionOrigin::Static, None));
+    }
+    let indirect = context.indirect_information();
+    let mut members: Vec<Member> = consensus
+        .members
+        .iter()
+        .map(|n| {
+            let state = &states[n.index];
+            let solved = state.own.as_ref().filter(|_| state.origin == MotionOrigin::Solved);
+            let information = solved.map_or(indirect, |own| own.information);
+            context.member(index, n.index, n.affinity, state, information)
+        })
+        .collect();
+    members.extend(own.as_ref().map(|own| Member {
+        offset: DVec3::ZERO,
+        translation: own.translation,
+        information: own.information,
+        affinity: 1.0,
+    }));
+    let RigidMotion { translation, rotation } = fit_rigid_motion(
+        &members,
+        &[],
+        consensus.translation,
+        context.neighbourhood.spacing,
+        context.settings,
+    );
+    Some(State { origin: MotionOrigin::Propagated, translation, rotation, own })
+}
+
+/// Whether the seen directions of a position agree with a translation taken from neighbours.
+fn agrees(own: &Lift, translation: DVec3, settings: &MotionSettings) -> bool {
+    let difference = translation - own.translation;
+    // The neighbours' own error is a strain; a factor of two in deviations leaves room for it.
+    let limit = 2.0 * settings.outlier_significance;
+    let rest = difference.dot(own.information * difference);
+    rest <= limit * limit
+}

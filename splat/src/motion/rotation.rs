@@ -1,0 +1,270 @@
+//! How a Gaussian turns: from its neighbours' displacements and from its own footprints' deformation.
+
+use glam::{DMat3, DQuat, DVec3};
+use nalgebra::{SMatrix, SVector};
+
+use super::{
+    MotionSettings,
+    fit2d::Fit,
+    linear::{cross_matrix, outer},
+};
+use crate::{cameras::Camera, gaussians::Gaussians};
+
+type Matrix6 = SMatrix<f64, 6, 6>;
+type Vector6 = SVector<f64, 6>;
+
+/// Gauss-Newton steps on the rigid motion; a rotation of 180° takes about six.
+const STEPS: usize = 10;
+/// Longest step, radians: keeps the linearisation honest.
+const LONGEST_STEP: f64 = 0.7;
+/// Strain at which a neighbour stops counting as part of the same body, at the first and from the fourth step:
+/// a body that turns must not shed its members before the turn is found.
+const BODY_STRAIN: [f64; 4] = [2.0, 1.0, 0.5, 0.25];
+/// Relative error of a footprint's affine motion along a Gaussian's axis as thick as its thinnest: how much of the axis lies
+/// out of the tracked surface.
+const OFF_SURFACE: f64 = 0.3;
+/// The same for an infinitely thin Gaussian: the footprint is small but not infinitesimal.
+const LEAST_AXIS_ERROR: f64 = 1e-3;
+
+/// A displaced point of the neighbourhood.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Member {
+    /// Position relative to the centre, before the motion.
+    pub offset: DVec3,
+    pub translation: DVec3,
+    /// Inverse covariance of `translation`.
+    pub information: DMat3,
+    /// How much it belongs to the centre, 0 to 1.
+    pub affinity: f64,
+}
+
+/// Where an axis of the Gaussian is seen to turn to.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TurnedAxis {
+    /// Unit axis before the motion.
+    pub from: DVec3,
+    /// The same material line after it.
+    pub to: DVec3,
+    /// Inverse covariance of `to`.
+    pub information: DMat3,
+}
+
+/// A rigid motion of a neighbourhood about its centre.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct RigidMotion {
+    /// Displacement of the centre.
+    pub translation: DVec3,
+    /// Identity unless significant.
+    pub rotation: DQuat,
+}
+
+/// Fits `d_j ≈ t + (R − I) x_j` to the members and `y_k ≈ R q_k` to the axes, each by its information.
+///
+/// Both sources meet in one least-squares problem on SE(3), so that each direction of rotation comes from whichever
+/// knows it better. Members that do not move with the rest are shed by redescending weights on their strain. The
+/// rotation is the identity unless it exceeds `rotation_significance` of its standard deviations, where the deviations grow with
+/// the misfit. `start` is the translation from which members are judged first.
+pub(super) fn fit_rigid_motion(
+    members: &[Member],
+    axes: &[TurnedAxis],
+    start: DVec3,
+    spacing: f64,
+    settings: &MotionSettings,
+) -> RigidMotion {
+    let unturned = RigidMotion { translation: start, rotation: DQuat::IDENTITY };
+    let mut motion = unturned;
+    let mut system = System::new(members, axes, &motion, BODY_STRAIN[0], spacing, settings);
+    for step in 1..=STEPS {
+        let Some(increment) = system.solve() else { return unturned };
+        let translation = DVec3::new(increment[0], increment[1], increment[2]);
+        let turn = DVec3::new(increment[3], increment[4], increment[5]).clamp_length_max(LONGEST_STEP);
+        if !(translation.is_finite() && turn.is_finite()) {
+            return unturned;
+        }
+        motion.translation += translation;
+        motion.rotation = (DQuat::from_scaled_axis(turn) * motion.rotation).normalize();
+        let strain = BODY_STRAIN[step.min(BODY_STRAIN.len() - 1)];
+        system = System::new(members, axes, &motion, strain, spacing, settings);
+        if step >= BODY_STRAIN.len() && turn.length() < 1e-9 && translation.length() <= 1e-9 * spacing {
+            break;
+        }
+    }
+    let turn = motion.rotation.to_scaled_axis();
+    let is_significant = system
+        .rotation_information()
+        .is_some_and(|information| turn.dot(information * turn) > settings.rotation_significance.powi(2));
+    if is_significant { motion } else { RigidMotion { rotation: DQuat::IDENTITY, ..motion } }
+}
+
+/// Normal equations of the increments of translation and rotation vector.
+struct System {
+    normal: Matrix6,
+    right: Vector6,
+    chi_squared: f64,
+    /// Number of residuals, counted with their robust weights, less the six unknowns.
+    freedom: f64,
+    prior: f64,
+}
+
+impl System {
+    fn new(
+        members: &[Member],
+        axes: &[TurnedAxis],
+        motion: &RigidMotion,
+        body_strain: f64,
+        spacing: f64,
+        settings: &MotionSettings,
+    ) -> Self {
+        let turn = DMat3::from_quat(motion.rotation);
+        let prior = settings.expected_rotation.powi(2).max(f64::MIN_POSITIVE).recip();
+        let mut system = Self {
+            normal: Matrix6::zeros(),
+            right: Vector6::zeros(),
+            chi_squared: 0.0,
+            freedom: -6.0,
+            prior,
+        };
+        for member in members {
+            let lever = turn * member.offset;
+            let residual = member.translation - motion.translation - (lever - member.offset);
+            let tolerance = body_strain * (member.offset.length() + 0.1 * spacing).max(f64::MIN_POSITIVE);
+            let misfit = residual.length_squared() / (tolerance * tolerance);
+            let weight = member.affinity / (1.0 + misfit).powi(2);
+            system.add(DMat3::IDENTITY, -cross_matrix(lever), member.information, residual, weight);
+        }
+        for axis in axes {
+            let turned = turn * axis.from;
+            system.add(DMat3::ZERO, -cross_matrix(turned), axis.information, axis.to - turned, 1.0);
+        }
+        let rotation = motion.rotation.to_scaled_axis();
+        for axis in 0..3 {
+            system.normal[(3 + axis, 3 + axis)] += prior;
+            system.right[3 + axis] -= prior * rotation[axis];
+        }
+        system
+    }
+
+    /// Adds a residual that falls by `by_translation · δt + by_rotation · δω`.
+    fn add(
+        &mut self,
+        by_translation: DMat3,
+        by_rotation: DMat3,
+        information: DMat3,
+        residual: DVec3,
+        weight: f64,
+    ) {
+        let information = information * weight;
+        let (force, blocks) = (information * residual, [by_translation, by_rotation]);
+        for (row, left) in blocks.iter().enumerate() {
+            let pull = left.transpose() * force;
+            for (column, right) in blocks.iter().enumerate() {
+                let block = left.transpose() * information * *right;
+                for r in 0..3 {
+                    for c in 0..3 {
+                        self.normal[(3 * row + r, 3 * column + c)] += block.col(c)[r];
+                    }
+                }
+            }
+            for r in 0..3 {
+                self.right[3 * row + r] += pull[r];
+            }
+        }
+        self.chi_squared += residual.dot(force);
+        // A singular information matrix observes fewer than three components; counting all of them only lowers the
+        // estimated misfit where it is ill determined anyway.
+        self.freedom += 3.0 * weight;
+    }
+
+    /// Solves after scaling to a unit diagonal: translations and rotations have different units.
+    fn solve(&self) -> Option<Vector6> {
+        let scale = self.normal.diagonal().map(|d| 1.0 / d.max(f64::MIN_POSITIVE).sqrt());
+        let mut scaled = Matrix6::from_fn(|r, c| self.normal[(r, c)] * scale[r] * scale[c]);
+        for axis in 0..6 {
+            scaled[(axis, axis)] += 1e-12;
+        }
+        let solution = scaled.cholesky()?.solve(&self.right.component_mul(&scale));
+        Some(solution.component_mul(&scale))
+    }
+
+    /// Inverse covariance of the rotation vector once the translation is free: the Schur complement without the prior,
+    /// divided by the misfit.
+    fn rotation_information(&self) -> Option<DMat3> {
+        let block = |row: usize, column: usize| {
+            DMat3::from_cols_array(&std::array::from_fn(|k| self.normal[(row + k % 3, column + k / 3)]))
+        };
+        let of_rotation = block(3, 3) - DMat3::from_diagonal(DVec3::splat(self.prior));
+        let of_translation = block(0, 0);
+        let coupling = block(0, 3);
+        let free = if of_translation == DMat3::ZERO {
+            of_rotation
+        } else {
+            of_rotation - coupling.transpose() * of_translation.inverse() * coupling
+        };
+        let misfit = if self.freedom > 0.0 { (self.chi_squared / self.freedom).max(1.0) } else { 1.0 };
+        let information = free * misfit.recip();
+        information.is_finite().then_some(information)
+    }
+}
+
+/// One view's fit of a Gaussian whose new position is known.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Deformation<'a> {
+    pub camera: &'a Camera,
+    pub fit: &'a Fit,
+}
+
+/// Lifts the footprints' deformation to the Gaussian's axes: `T' F q ≈ A T q` for the deformation gradient `F`, with the
+/// Jacobian `T` at the old and `T'` at the new mean.
+///
+/// The relation holds for lines in the tracked surface only, so the thinnest axis takes no part, and an axis counts by how
+/// much it is longer than the thinnest: both major axes of a flat Gaussian, the long one of a needle, hardly any
+/// of a ball. Directions along which no view sees the axis turn stay as they were.
+pub(super) fn lift_axes(
+    gaussians: &Gaussians,
+    index: usize,
+    translation: DVec3,
+    deformations: &[Deformation<'_>],
+) -> Vec<TurnedAxis> {
+    let mean = gaussians.mean(index);
+    let axes = DMat3::from_quat(gaussians.rotation(index));
+    let log_scales = gaussians.log_scales[index].map(f64::from);
+    let thinnest = (0..3).fold(0, |least, k| if log_scales[k] < log_scales[least] { k } else { least });
+    (0..3)
+        .filter(|&k| k != thinnest)
+        .filter_map(|k| {
+            let off_surface =
+                (OFF_SURFACE * (log_scales[thinnest] - log_scales[k]).exp()).max(LEAST_AXIS_ERROR);
+            lift_axis(axes.col(k), off_surface, mean, mean + translation, deformations)
+        })
+        .collect()
+}
+
+fn lift_axis(
+    axis: DVec3,
+    off_surface: f64,
+    old_mean: DVec3,
+    new_mean: DVec3,
+    deformations: &[Deformation<'_>],
+) -> Option<TurnedAxis> {
+    let (mut information, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for Deformation { camera, fit } in deformations {
+        let [u, v] = camera.world_jacobian(camera.to_camera(old_mean));
+        let [new_u, new_v] = camera.world_jacobian(camera.to_camera(new_mean));
+        let projected = glam::DVec2::new(u.dot(axis), v.dot(axis));
+        let noise = projected.dot(fit.gradient_covariance * projected);
+        let variance = noise + (off_surface * projected.length()).powi(2);
+        if !(variance > 0.0) {
+            continue;
+        }
+        let seen = fit.gradient * projected;
+        information += (outer(new_u, new_u) + outer(new_v, new_v)) * variance.recip();
+        right += (new_u * (seen.x - new_u.dot(axis)) + new_v * (seen.y - new_v.dot(axis))) * variance.recip();
+    }
+    // Relative to the information itself, so that it only decides what nothing else does.
+    let trace = information.x_axis.x + information.y_axis.y + information.z_axis.z;
+    let ridge = DMat3::from_diagonal(DVec3::splat(1e-9 * trace));
+    let to = axis + (information + ridge).inverse() * right;
+    let is_lifted = trace > 0.0 && to.is_finite() && information.is_finite() && to.length_squared() > 0.0;
+    // The length is strain, not rotation.
+    is_lifted.then(|| TurnedAxis { from: axis, to: to.normalize(), information })
+}
