@@ -1,4 +1,5 @@
-//! Measures the tracker on clips with exact flow: `track_clip CLIP_FOLDER CAMERA... [--quality draft|balanced|best]`.
+//! Measures the tracker on clips with exact flow: `track_clip CLIP_FOLDER CAMERA...
+//! [--quality draft|balanced|best] [--set KEY=JSON]... [--maps FOLDER]`.
 #![allow(clippy::print_stdout, reason = "an example prints its figures")]
 
 use std::{
@@ -105,14 +106,28 @@ impl Figures {
     }
 }
 
+/// Grey: error of pixels rightly called visible, white at 4 px. Red: called visible but hidden. Blue: visible but
+/// called hidden, brighter with the error of the guess. Black: rightly called hidden.
+fn map_colour(error: f32, called_visible: bool, visible: bool) -> [f32; 3] {
+    let level = (error / 4.0).min(1.0);
+    match (called_visible, visible) {
+        (true, true) => [level; 3],
+        (true, false) => [1.0, 0.0, 0.0],
+        (false, true) => [0.0, 0.3 * level, 0.5 + 0.5 * level],
+        (false, false) => [0.0; 3],
+    }
+}
+
 fn main() -> Result<(), Anything> {
     let mut quality = Quality::Balanced;
     let mut overrides = serde_json::Map::new();
     let mut words = Vec::new();
+    let mut maps: Option<PathBuf> = None;
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--quality" => quality = serde_json::from_value(arguments.next().ok_or("--quality WHICH")?.into())?,
+            "--maps" => maps = Some(PathBuf::from(arguments.next().ok_or("--maps FOLDER")?)),
             "--set" => {
                 let pair = arguments.next().ok_or("--set KEY=VALUE")?;
                 let (key, value) = pair.split_once('=').ok_or("--set KEY=VALUE")?;
@@ -152,6 +167,7 @@ fn main() -> Result<(), Anything> {
         for (t, field) in fields.iter().enumerate() {
             let pixels = field.positions.len();
             let mut frame_moving = Figures::default();
+            let mut map = Image::filled(field.width, field.height, [0.0; 3]);
             for i in 0..pixels {
                 if exact.as_ref().is_some_and(|exact| !packed_bit(&exact.valid, i)) {
                     continue;
@@ -163,6 +179,8 @@ fn main() -> Result<(), Anything> {
                 let truth = [column as f32 + 0.5 + flow(0), row as f32 + 0.5 + flow(1)];
                 let bytes = pixels.div_ceil(8);
                 let seen = exact.as_ref().is_none_or(|exact| packed_bit(&exact.visible[t * bytes..], i));
+                let off = (field.positions[i][0] - truth[0]).hypot(field.positions[i][1] - truth[1]);
+                map.pixels[3 * i..3 * i + 3].copy_from_slice(&map_colour(off, field.visible[i], seen));
                 let is_mover = moves.as_ref().is_some_and(|mask| mask.inside[i]);
                 let groups = if is_mover { [&mut all, &mut moving] } else { [&mut all, &mut still] };
                 for group in groups {
@@ -171,6 +189,10 @@ fn main() -> Result<(), Anything> {
                 if is_mover {
                     frame_moving.add(field.positions[i], field.visible[i], field.sigma[i], truth, seen);
                 }
+            }
+            if let Some(folder) = &maps {
+                fs::create_dir_all(folder)?;
+                fs::write(folder.join(format!("{camera}_{}", name(t + 1))), map.encode_png())?;
             }
             frame_moving.print(&format!("{camera} {}", t + 2));
         }

@@ -88,8 +88,8 @@ fn descend_pyramid(
             settings.patch_iterations,
         );
         let dense = patches::densify(planes, &to.levels[level], &field);
-        let smoothing = Smoothing { weight: settings.smoothness, iterations: settings.smoothing_iterations };
-        flow = refine::refine(&from.reference(level), &to.levels[level], &dense, None, smoothing);
+        let smoothing = Smoothing { weight: settings.smoothness, warps: settings.smoothing_warps, window: settings.smoothing_window, iterations: settings.smoothing_iterations };
+        flow = refine::refine(&from.reference(level), &to.levels[level], &dense, smoothing);
         if level > 0 {
             let finer = &from.levels[level - 1];
             flow = flow.resampled_nearest(finer.width, finer.height, 2.0);

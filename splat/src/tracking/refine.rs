@@ -21,32 +21,34 @@ const SHADING_RADIUS: usize = 4;
 pub(super) struct Smoothing {
     /// Weight of smoothness against colour constancy.
     pub(super) weight: f32,
-    /// Sweeps over the image.
+    /// How often the residuals are linearised anew.
+    pub(super) warps: u32,
+    /// Half side of the windows that share one displacement in the data term, pixels.
+    pub(super) window: u32,
+    /// Sweeps over the image per linearisation.
     pub(super) iterations: u32,
 }
 
-/// Refines `flow` from `reference` to `target`. `trust` is 0 where colour must not be believed (occlusions), 1
-/// elsewhere.
+/// Refines `flow` from `reference` to `target`.
 pub(super) fn refine(
     reference: &Reference<'_>,
     target: &Planes,
     flow: &Flow,
-    trust: Option<&[f32]>,
     smoothing: Smoothing,
 ) -> Flow {
     if smoothing.iterations == 0 {
         return flow.clone();
     }
-    let mut data = DataTerm::new(reference, target, flow);
-    if let Some(trust) = trust {
-        data.scale(trust);
-    }
-    let links = Links::new(reference.planes, flow, smoothing.weight);
     let mut current = flow.clone();
     let mut next = flow.clone();
-    for _ in 0..smoothing.iterations {
-        sweep(flow, &data, &links, &current, &mut next);
-        std::mem::swap(&mut current, &mut next);
+    for _ in 0..smoothing.warps {
+        let start = current.clone();
+        let data = DataTerm::new(reference, target, &start, smoothing.window as usize);
+        let links = Links::new(reference.planes, &start, smoothing.weight);
+        for _ in 0..smoothing.iterations {
+            sweep(&start, &data, &links, &current, &mut next);
+            std::mem::swap(&mut current, &mut next);
+        }
     }
     current
 }
@@ -61,7 +63,7 @@ struct DataTerm {
 }
 
 impl DataTerm {
-    fn new(reference: &Reference<'_>, target: &Planes, flow: &Flow) -> Self {
+    fn new(reference: &Reference<'_>, target: &Planes, flow: &Flow, window: usize) -> Self {
         let (width, height) = (flow.width, flow.height);
         let residuals = residuals(reference.planes, target, flow)
             .map(|channel| subtract(&channel, &box_mean(&channel, width, height, SHADING_RADIUS)));
@@ -92,13 +94,10 @@ impl DataTerm {
                 right_y[i] = weight * (gy[0] * r[0] + gy[1] * r[1] + gy[2] * r[2]);
             }
         }
-        term
-    }
-
-    fn scale(&mut self, trust: &[f32]) {
-        for values in [&mut self.xx, &mut self.xy, &mut self.yy, &mut self.x, &mut self.y] {
-            values.iter_mut().zip(trust).for_each(|(value, trust)| *value *= trust);
+        for values in [&mut term.xx, &mut term.xy, &mut term.yy, &mut term.x, &mut term.y] {
+            *values = box_mean(values, width, height, window);
         }
+        term
     }
 }
 

@@ -23,9 +23,13 @@ pub struct TrackingSettings {
     pub patch_stride: u32,
     /// Descent steps per patch and level; 1 and up, default 12.
     pub patch_iterations: u32,
-    /// Weight of smoothness against colour constancy; 0 and up, default 20.
+    /// Weight of smoothness against colour constancy; 0 and up, default 150.
     pub smoothness: f32,
-    /// Sweeps of the variational refinement per level; 0 (off) and up, default 10.
+    /// Linearisations of the variational refinement per level; 0 (off) and up, default 2.
+    pub smoothing_warps: u32,
+    /// Half side of the windows that share one displacement in the refinement, pixels; 0 to 10, default 2.
+    pub smoothing_window: u32,
+    /// Sweeps of the variational refinement per linearisation; 0 (off) and up, default 10.
     pub smoothing_iterations: u32,
     /// Forward-backward error above which a pixel is called hidden, pixels; above 0, default 1.5.
     pub consistency: f32,
@@ -53,7 +57,9 @@ impl TrackingSettings {
             gaps: vec![1, 2],
             patch_stride: 4,
             patch_iterations: 12,
-            smoothness: 20.0,
+            smoothness: 150.0,
+            smoothing_warps: 2,
+            smoothing_window: 2,
             smoothing_iterations: 10,
             consistency: 1.5,
             correlation: 0.5,
