@@ -70,6 +70,7 @@ fn descend_pyramid(
     settings: &TrackingSettings,
 ) -> Flow {
     let coarsest = from.levels.len() - 1;
+    let smoothing = Smoothing::of(settings);
     let mut flow = seeds.clone();
     for level in (0..=coarsest).rev() {
         let planes = &from.levels[level];
@@ -88,8 +89,7 @@ fn descend_pyramid(
             settings.patch_iterations,
         );
         let dense = patches::densify(planes, &to.levels[level], &field);
-        let smoothing = Smoothing { weight: settings.smoothness, warps: settings.smoothing_warps, window: settings.smoothing_window, iterations: settings.smoothing_iterations };
-        flow = refine::refine(&from.reference(level), &to.levels[level], &dense, smoothing);
+        flow = refine::refine(&from.reference(level), &to.levels[level], &dense, None, smoothing);
         if level > 0 {
             let finer = &from.levels[level - 1];
             flow = flow.resampled_nearest(finer.width, finer.height, 2.0);

@@ -2,6 +2,7 @@
 //! It fills untextured areas from their surroundings and takes the patch grid out of the flow.
 
 use super::{
+    TrackingSettings,
     flow::Flow,
     patches::Reference,
     planes::{Planes, box_mean},
@@ -29,11 +30,23 @@ pub(super) struct Smoothing {
     pub(super) iterations: u32,
 }
 
-/// Refines `flow` from `reference` to `target`.
+impl Smoothing {
+    pub(super) fn of(settings: &TrackingSettings) -> Self {
+        Self {
+            weight: settings.smoothness,
+            warps: settings.smoothing_warps,
+            window: settings.smoothing_window,
+            iterations: settings.smoothing_iterations,
+        }
+    }
+}
+
+/// Refines `flow` from `reference` to `target`; where `trust` is given and false, colour does not count.
 pub(super) fn refine(
     reference: &Reference<'_>,
     target: &Planes,
     flow: &Flow,
+    trust: Option<&[bool]>,
     smoothing: Smoothing,
 ) -> Flow {
     if smoothing.iterations == 0 {
@@ -43,7 +56,7 @@ pub(super) fn refine(
     let mut next = flow.clone();
     for _ in 0..smoothing.warps {
         let start = current.clone();
-        let data = DataTerm::new(reference, target, &start, smoothing.window as usize);
+        let data = DataTerm::new(reference, target, &start, trust, smoothing.window as usize);
         let links = Links::new(reference.planes, &start, smoothing.weight);
         for _ in 0..smoothing.iterations {
             sweep(&start, &data, &links, &current, &mut next);
@@ -63,7 +76,7 @@ struct DataTerm {
 }
 
 impl DataTerm {
-    fn new(reference: &Reference<'_>, target: &Planes, flow: &Flow, window: usize) -> Self {
+    fn new(reference: &Reference<'_>, target: &Planes, flow: &Flow, trust: Option<&[bool]>, window: usize) -> Self {
         let (width, height) = (flow.width, flow.height);
         let residuals = residuals(reference.planes, target, flow)
             .map(|channel| subtract(&channel, &box_mean(&channel, width, height, SHADING_RADIUS)));
@@ -86,7 +99,8 @@ impl DataTerm {
                 let gx = [gradient_x[0][i], gradient_x[1][i], gradient_x[2][i]];
                 let gy = [gradient_y[0][i], gradient_y[1][i], gradient_y[2][i]];
                 let squares = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * (1.0 / 3.0);
-                let weight = 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt();
+                let trusted = trust.is_none_or(|trust| trust[line.start + i]);
+                let weight = if trusted { 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt() } else { 0.0 };
                 xx[i] = weight * (gx[0] * gx[0] + gx[1] * gx[1] + gx[2] * gx[2]);
                 xy[i] = weight * (gx[0] * gy[0] + gx[1] * gy[1] + gx[2] * gy[2]);
                 yy[i] = weight * (gy[0] * gy[0] + gy[1] * gy[1] + gy[2] * gy[2]);

@@ -7,6 +7,7 @@ use super::{
     consistency::{self, Judged},
     flow::Flow,
     pair::{Frame, Guides, match_frames},
+    refine::{Smoothing, refine},
 };
 use crate::image::Image;
 
@@ -80,7 +81,7 @@ impl<'a> Tracker<'a> {
         let direct = self.direct(&frame, guess.as_ref());
         // The direct match comes first: of equals, the one that cannot have drifted.
         let candidates: Vec<Judged> = std::iter::once(direct).chain(chains).collect();
-        let tracks = chain::choose(&candidates);
+        let tracks = self.anchored(&frame, chain::choose(&candidates));
         let field = self.field(&tracks);
 
         let texture = consistency::texture(&frame);
@@ -116,6 +117,13 @@ impl<'a> Tracker<'a> {
         };
         let (flow, back) = match_frames(&self.key, frame, guides, self.settings);
         consistency::judge(&self.key, frame, flow, &back, &self.key_texture, self.settings)
+    }
+
+    /// The tracks, refined once more against the key frame itself.
+    fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
+        let smoothing = Smoothing::of(self.settings);
+        let flow = refine(&self.key.reference(0), &frame.levels[0], &tracks.flow, Some(&tracks.visible), smoothing);
+        Judged { flow, ..tracks }
     }
 
     /// The tracks at the resolution of the images.
