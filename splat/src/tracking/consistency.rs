@@ -4,7 +4,7 @@ use super::{
     TrackingSettings,
     flow::Flow,
     pair::Frame,
-    planes::{PATCH, box_counts, box_sum},
+    planes::{PATCH, box_counts, box_mean, box_sum},
     refine::residuals,
 };
 
@@ -23,6 +23,11 @@ const WINDOW: usize = 2;
 const NOISE: f32 = 6.0;
 /// Difference of mean colour, after the best change of brightness, that the same surface may show, 0 to 255 scale.
 const COLOUR_TOLERANCE: f32 = 24.0;
+
+/// Half side of the window whose spread of flow counts as risk, pixels.
+const BOUNDARY_WINDOW: usize = 3;
+/// Share of that spread's variance that is added to a track's own.
+const BOUNDARY_RISK: f32 = 0.1;
 
 /// Agreement of the surroundings of each pixel with where a flow puts them.
 pub(super) struct Agreement {
@@ -144,5 +149,23 @@ pub(super) fn recheck(first: &Frame, second: &Frame, judged: &mut Judged, settin
     let agreement = agreement(first, second, &judged.flow);
     for (i, visible) in judged.visible.iter_mut().enumerate() {
         *visible = *visible && agreement.holds(i, settings.correlation);
+    }
+}
+
+/// Adds what the neighbourhood says about the risk of following the wrong surface: next to a motion boundary the
+/// windows of all comparisons straddle it.
+pub(super) fn widen_at_boundaries(judged: &mut Judged) {
+    let flow = &judged.flow;
+    let (width, height) = (flow.width, flow.height);
+    let mean = |values: &[f32]| box_mean(values, width, height, BOUNDARY_WINDOW);
+    let mut variance = vec![0.0f32; width * height];
+    for axis in [&flow.u, &flow.v] {
+        let squares: Vec<f32> = axis.iter().map(|value| value * value).collect();
+        for ((sum, square), mean) in variance.iter_mut().zip(mean(&squares)).zip(mean(axis)) {
+            *sum += (square - mean * mean).max(0.0);
+        }
+    }
+    for (sigma, variance) in judged.sigma.iter_mut().zip(variance) {
+        *sigma = (*sigma * *sigma + BOUNDARY_RISK * variance).sqrt();
     }
 }

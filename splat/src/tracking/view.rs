@@ -123,7 +123,9 @@ impl<'a> Tracker<'a> {
     fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
         let smoothing = Smoothing::of(self.settings);
         let flow = refine(&self.key.reference(0), &frame.levels[0], &tracks.flow, Some(&tracks.visible), smoothing);
-        Judged { flow, ..tracks }
+        let mut anchored = Judged { flow, ..tracks };
+        consistency::widen_at_boundaries(&mut anchored);
+        anchored
     }
 
     /// The tracks at the resolution of the images.
