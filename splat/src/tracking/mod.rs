@@ -1,4 +1,25 @@
-//! Dense tracks from the key frame to every frame of a view.
+//! Dense tracks from the key frame to every frame of a view, without trained weights.
+//!
+//! Each pair of frames is matched both ways: exhaustive search on a small image for jumps, dense inverse search down
+//! a pyramid, variational refinement. Forward-backward and photometric agreement decide what is visible and how
+//! certain. Tracks to a frame are the direct match with the key frame or a continuation of an earlier frame's
+//! tracks, per pixel whichever is more certain.
+
+mod chain;
+mod coarse;
+mod consistency;
+mod flow;
+mod pair;
+mod patches;
+mod planes;
+mod refine;
+mod settings;
+#[cfg(test)]
+mod tests;
+mod view;
+
+pub use settings::TrackingSettings;
+pub use view::track_view;
 
 /// Where each key-frame pixel of one view is at one frame.
 ///
@@ -15,39 +36,4 @@ pub struct TrackField {
     pub visible: Vec<bool>,
     /// Standard deviation of the tracked position per axis, pixels.
     pub sigma: Vec<f32>,
-}
-
-use serde::{Deserialize, Serialize};
-
-use crate::settings::Quality;
-
-/// How dense tracks are found.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TrackingSettings {}
-
-impl Default for TrackingSettings {
-    fn default() -> Self {
-        Self::preset(Quality::default())
-    }
-}
-
-impl TrackingSettings {
-    /// The settings of a quality level.
-    pub fn preset(_quality: Quality) -> Self {
-        Self {}
-    }
-}
-
-/// Tracks every pixel of frame 0 of one view to each later frame.
-///
-/// `load(i)` gives frame `i` of `frame_count` (0 is the key frame); `emit(i, field)` takes the field of frame `i`,
-/// in ascending order from 1. The first error of either ends the work.
-pub fn track_view<E>(
-    _frame_count: usize,
-    _load: &mut dyn FnMut(usize) -> Result<std::sync::Arc<crate::image::Image>, E>,
-    _settings: &TrackingSettings,
-    _emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
-) -> Result<(), E> {
-    unimplemented!("lands with the tracking commit")
 }

@@ -1,0 +1,171 @@
+//! Which flow vectors to believe, and how far: forward-backward error, photometric agreement, local texture.
+
+use super::{
+    TrackingSettings,
+    flow::Flow,
+    pair::Frame,
+    planes::{PATCH, box_counts, box_mean, box_sum},
+    refine::residuals,
+};
+
+/// A flow with the doubts about it, per pixel.
+#[derive(Clone)]
+pub(super) struct Judged {
+    pub(super) flow: Flow,
+    pub(super) visible: Vec<bool>,
+    /// Standard deviation per axis, pixels.
+    pub(super) sigma: Vec<f32>,
+}
+
+/// Half side of the windows that are correlated.
+const WINDOW: usize = 2;
+/// Root mean square difference that image noise alone explains, 0 to 255 scale.
+const NOISE: f32 = 6.0;
+/// Difference of mean colour, after the best change of brightness, that the same surface may show, 0 to 255 scale.
+const COLOUR_TOLERANCE: f32 = 24.0;
+
+/// Half side of the window whose spread of flow counts as risk, pixels.
+const BOUNDARY_WINDOW: usize = 3;
+/// Share of that spread's variance that is added to a track's own.
+const BOUNDARY_RISK: f32 = 0.1;
+
+/// Agreement of the surroundings of each pixel with where a flow puts them.
+pub(super) struct Agreement {
+    /// Mean squared difference per channel, means removed.
+    residual: Vec<f32>,
+    /// Normalised correlation over all channels.
+    correlation: Vec<f32>,
+    /// Distance of mean colours that no change of brightness explains.
+    colour: Vec<f32>,
+}
+
+/// Compares windows around each pixel of `first` with `second` fetched along `flow`.
+pub(super) fn agreement(first: &Frame, second: &Frame, flow: &Flow) -> Agreement {
+    let (width, height) = (flow.width, flow.height);
+    let counts = box_counts(width, height, WINDOW);
+    let here = first.levels[0].interiors();
+    let there: [Vec<f32>; 3] = {
+        let differences = residuals(&first.levels[0], &second.levels[0], flow);
+        std::array::from_fn(|c| here[c].iter().zip(&differences[c]).map(|(a, d)| a + d).collect())
+    };
+    let sum = |values: &[f32]| box_sum(values, width, height, WINDOW);
+    let products = |a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]| -> Vec<f32> {
+        sum(&(0..width * height).map(|i| a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i]).collect::<Vec<_>>())
+    };
+    let (aa, ab, bb) = (products(&here, &here), products(&here, &there), products(&there, &there));
+    let means = |planes: &[Vec<f32>; 3]| -> [Vec<f32>; 3] {
+        std::array::from_fn(|c| sum(&planes[c]).iter().zip(&counts).map(|(sum, count)| sum / count).collect())
+    };
+    let (mean_here, mean_there) = (means(&here), means(&there));
+    let mut out = Agreement { residual: Vec::new(), correlation: Vec::new(), colour: Vec::new() };
+    for i in 0..width * height {
+        let a = [mean_here[0][i], mean_here[1][i], mean_here[2][i]];
+        let b = [mean_there[0][i], mean_there[1][i], mean_there[2][i]];
+        let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let variance_here = (aa[i] / counts[i] - dot(a, a)).max(0.0);
+        let variance_there = (bb[i] / counts[i] - dot(b, b)).max(0.0);
+        let covariance = ab[i] / counts[i] - dot(a, b);
+        out.residual.push((variance_here + variance_there - 2.0 * covariance).max(0.0) / 3.0);
+        out.correlation.push(covariance / (variance_here * variance_there + 1.0).sqrt());
+        let gain = (dot(a, b) / (dot(a, a) + 1.0)).clamp(0.4, 2.5);
+        let off = [b[0] - gain * a[0], b[1] - gain * a[1], b[2] - gain * a[2]];
+        out.colour.push(dot(off, off).sqrt());
+    }
+    out
+}
+
+impl Agreement {
+    fn holds(&self, i: usize, least_correlation: f32) -> bool {
+        let textured_alike = self.correlation[i] >= least_correlation || self.residual[i] < NOISE * NOISE;
+        textured_alike && self.colour[i] < COLOUR_TOLERANCE
+    }
+}
+
+/// Smaller eigenvalue of the structure tensor around each pixel of the finest level, summed over channels and a
+/// window of about a patch.
+pub(super) fn texture(frame: &Frame) -> Vec<f32> {
+    let (width, height) = (frame.width(), frame.height());
+    let [gx, gy] = frame.gradients[0].each_ref().map(|planes| planes.interiors());
+    let tensor = |a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]| {
+        let products: Vec<f32> =
+            (0..width * height).map(|i| a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i]).collect();
+        box_sum(&products, width, height, PATCH / 2 - 1)
+    };
+    let (xx, xy, yy) = (tensor(&gx, &gx), tensor(&gx, &gy), tensor(&gy, &gy));
+    let smaller = |i: usize| {
+        let (mean, half) = (0.5 * (xx[i] + yy[i]), 0.5 * (xx[i] - yy[i]));
+        (mean - (half * half + xy[i] * xy[i]).sqrt()).max(0.0)
+    };
+    (0..width * height).map(smaller).collect()
+}
+
+/// Distance between each pixel and where it comes back to.
+fn round_trip(flow: &Flow, back: &Flow) -> Vec<f32> {
+    let mut error = Vec::with_capacity(flow.u.len());
+    for y in 0..flow.height {
+        for x in 0..flow.width {
+            let [u, v] = flow.at(x, y);
+            let [bu, bv] = back.sample(x as f32 + u, y as f32 + v);
+            error.push(((u + bu).powi(2) + (v + bv).powi(2)).sqrt());
+        }
+    }
+    error
+}
+
+/// Judges the flow from `first` to `second` by the flow back and by what both frames show.
+pub(super) fn judge(
+    first: &Frame,
+    second: &Frame,
+    flow: Flow,
+    back: &Flow,
+    texture: &[f32],
+    settings: &TrackingSettings,
+) -> Judged {
+    let error = round_trip(&flow, back);
+    let agreement = agreement(first, second, &flow);
+    let mut visible = Vec::with_capacity(error.len());
+    let mut sigma = Vec::with_capacity(error.len());
+    for y in 0..flow.height {
+        for x in 0..flow.width {
+            let i = y * flow.width + x;
+            let [u, v] = flow.at(x, y);
+            let inside = is_inside(x as f32 + u, y as f32 + v, flow.width, flow.height);
+            visible.push(inside && error[i] < settings.consistency && agreement.holds(i, settings.correlation));
+            let noise = agreement.residual[i].max(4.0);
+            let variance = settings.sigma_floor.powi(2) + 0.5 * error[i] * error[i] + noise / (texture[i] + 1e-3);
+            sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
+        }
+    }
+    Judged { flow, visible, sigma }
+}
+
+/// Whether a fractional pixel index lies within the image.
+pub(super) fn is_inside(x: f32, y: f32, width: usize, height: usize) -> bool {
+    x >= -0.5 && y >= -0.5 && x <= width as f32 - 0.5 && y <= height as f32 - 0.5
+}
+
+/// Withdraws visibility where the frames disagree along the flow: a chain of good steps can still end elsewhere.
+pub(super) fn recheck(first: &Frame, second: &Frame, judged: &mut Judged, settings: &TrackingSettings) {
+    let agreement = agreement(first, second, &judged.flow);
+    for (i, visible) in judged.visible.iter_mut().enumerate() {
+        *visible = *visible && agreement.holds(i, settings.correlation);
+    }
+}
+
+/// Adds what the neighbourhood says about the risk of following the wrong surface: next to a motion boundary the
+/// windows of all comparisons straddle it.
+pub(super) fn widen_at_boundaries(judged: &mut Judged) {
+    let flow = &judged.flow;
+    let (width, height) = (flow.width, flow.height);
+    let mean = |values: &[f32]| box_mean(values, width, height, BOUNDARY_WINDOW);
+    let mut variance = vec![0.0f32; width * height];
+    for axis in [&flow.u, &flow.v] {
+        let squares: Vec<f32> = axis.iter().map(|value| value * value).collect();
+        for ((sum, square), mean) in variance.iter_mut().zip(mean(&squares)).zip(mean(axis)) {
+            *sum += (square - mean * mean).max(0.0);
+        }
+    }
+    for (sigma, variance) in judged.sigma.iter_mut().zip(variance) {
+        *sigma = (*sigma * *sigma + BOUNDARY_RISK * variance).sqrt();
+    }
+}

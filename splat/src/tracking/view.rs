@@ -1,0 +1,161 @@
+//! Tracking of one view, frame after frame.
+
+use std::{collections::VecDeque, sync::Arc};
+
+use super::{
+    TrackField, TrackingSettings, chain,
+    consistency::{self, Judged},
+    flow::Flow,
+    pair::{Frame, Guides, match_frames},
+    refine::{Smoothing, refine},
+};
+use crate::image::Image;
+
+/// A frame that later frames may be chained to.
+struct Past {
+    index: usize,
+    frame: Frame,
+    texture: Vec<f32>,
+    tracks: Judged,
+}
+
+/// Tracks every pixel of frame 0 of one view to each later frame.
+///
+/// `load(i)` gives frame `i` of `frame_count` (0 is the key frame); `emit(i, field)` takes the field of frame `i`,
+/// in ascending order from 1. The first error of either ends the work. Positions are finite whatever the frames
+/// hold; where nothing can be said (a frame of another size than the key frame, say) all pixels are hidden and stay
+/// where they were.
+pub fn track_view<E>(
+    frame_count: usize,
+    load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+    settings: &TrackingSettings,
+    emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+) -> Result<(), E> {
+    if frame_count < 2 {
+        return Ok(());
+    }
+    let key_image = load(0)?;
+    let size = (key_image.width, key_image.height);
+    let empty = key_image.pixel_count() == 0;
+    let mut tracker = if empty { None } else { Some(Tracker::new(&key_image, settings)) };
+    drop(key_image);
+    for index in 1..frame_count {
+        let image = load(index)?;
+        let field = match &mut tracker {
+            Some(tracker) if (image.width, image.height) == size => tracker.track(index, &image),
+            _ => unknown(size, settings),
+        };
+        emit(index, field)?;
+    }
+    Ok(())
+}
+
+/// All pixels hidden, where they were.
+fn unknown((width, height): (u32, u32), settings: &TrackingSettings) -> TrackField {
+    let pixels = width as usize * height as usize;
+    let centres = (0..height).flat_map(|y| (0..width).map(move |x| [x as f32 + 0.5, y as f32 + 0.5]));
+    let sigma = width.max(height) as f32 + settings.hidden_sigma;
+    TrackField { width, height, positions: centres.collect(), visible: vec![false; pixels], sigma: vec![sigma; pixels] }
+}
+
+struct Tracker<'a> {
+    settings: &'a TrackingSettings,
+    width: u32,
+    height: u32,
+    key: Frame,
+    key_texture: Vec<f32>,
+    past: VecDeque<Past>,
+}
+
+impl<'a> Tracker<'a> {
+    fn new(key: &Image, settings: &'a TrackingSettings) -> Self {
+        let frame = Frame::new(key, settings);
+        let key_texture = consistency::texture(&frame);
+        Self { settings, width: key.width, height: key.height, key: frame, key_texture, past: VecDeque::new() }
+    }
+
+    fn track(&mut self, index: usize, image: &Image) -> TrackField {
+        let frame = Frame::new(image, self.settings);
+        let chains = self.chains(index, &frame);
+        let guess = (!chains.is_empty()).then(|| chain::choose(&chains));
+        let direct = self.direct(&frame, guess.as_ref());
+        // The direct match comes first: of equals, the one that cannot have drifted.
+        let candidates: Vec<Judged> = std::iter::once(direct).chain(chains).collect();
+        let tracks = self.anchored(&frame, chain::choose(&candidates));
+        let field = self.field(&tracks);
+
+        let texture = consistency::texture(&frame);
+        self.past.push_back(Past { index, frame, texture, tracks });
+        let longest = self.settings.gaps.iter().copied().max().unwrap_or(0) as usize;
+        while self.past.front().is_some_and(|past| past.index + longest <= index) {
+            self.past.pop_front();
+        }
+        field
+    }
+
+    /// The tracks of earlier frames, continued to this one.
+    fn chains(&self, index: usize, frame: &Frame) -> Vec<Judged> {
+        let earlier = self.settings.gaps.iter().filter_map(|&gap| {
+            self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
+        });
+        let continue_from = |past: &Past| {
+            let (flow, back) = match_frames(&past.frame, frame, None, self.settings);
+            let onward = consistency::judge(&past.frame, frame, flow, &back, &past.texture, self.settings);
+            let mut chained = chain::chain(&past.tracks, &onward);
+            consistency::recheck(&self.key, frame, &mut chained, self.settings);
+            chained
+        };
+        earlier.map(continue_from).collect()
+    }
+
+    /// The match of the key frame with this one, helped by the chained tracks.
+    fn direct(&self, frame: &Frame, guess: Option<&Judged>) -> Judged {
+        let back: Option<Flow> = guess.map(chain::inverted);
+        let guides = match (guess, &back) {
+            (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward }),
+            _ => None,
+        };
+        let (flow, back) = match_frames(&self.key, frame, guides, self.settings);
+        consistency::judge(&self.key, frame, flow, &back, &self.key_texture, self.settings)
+    }
+
+    /// The tracks, refined once more against the key frame itself.
+    fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
+        let smoothing = Smoothing::of(self.settings);
+        let flow = refine(&self.key.reference(0), &frame.levels[0], &tracks.flow, Some(&tracks.visible), smoothing);
+        let mut anchored = Judged { flow, ..tracks };
+        consistency::widen_at_boundaries(&mut anchored);
+        anchored
+    }
+
+    /// The tracks at the resolution of the images.
+    fn field(&self, tracks: &Judged) -> TrackField {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let flow = &tracks.flow;
+        // Every halving rounds up, so the scale is the power of two, not the ratio of the sizes.
+        let mut scale = 1.0;
+        while (width as f32 / scale).ceil() as usize > flow.width || (height as f32 / scale).ceil() as usize > flow.height {
+            scale *= 2.0;
+        }
+        let mut field = TrackField {
+            width: self.width,
+            height: self.height,
+            positions: Vec::with_capacity(width * height),
+            visible: Vec::with_capacity(width * height),
+            sigma: Vec::with_capacity(width * height),
+        };
+        for y in 0..height {
+            for x in 0..width {
+                let (fx, fy) = ((x as f32 + 0.5) / scale - 0.5, (y as f32 + 0.5) / scale - 0.5);
+                let [u, v] = flow.sample(fx, fy);
+                let corners = flow.corners(fx, fy);
+                let visible = corners.iter().all(|&(corner, weight)| weight < 0.05 || tracks.visible[corner]);
+                let sigma: f32 = corners.iter().map(|&(corner, weight)| weight * tracks.sigma[corner]).sum();
+                field.positions.push([x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale]);
+                field.visible.push(visible);
+                field.sigma.push(sigma * scale + if visible { 0.0 } else { self.settings.hidden_sigma });
+            }
+        }
+        field
+    }
+}
