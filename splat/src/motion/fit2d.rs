@@ -13,6 +13,8 @@ pub(super) struct Fit {
     pub displacement: DVec2,
     /// Variance of `target` per axis, px².
     pub variance: f64,
+    /// The part of `variance` that the tracks claim; the rest was found in the residual.
+    pub claimed_variance: f64,
     /// The 2×2 affine part.
     pub gradient: DMat2,
     /// Covariance of a row of `gradient`; both rows have the same.
@@ -54,10 +56,13 @@ pub(super) fn fit(
     let displacement_at_centroid = footprint.tracked_centroid - footprint.centroid;
     let displacement = displacement_at_centroid + (gradient - DMat2::IDENTITY) * offset;
     let extrapolation = offset.dot(gradient_covariance * offset).max(0.0);
+    let claimed_share = if noise > 0.0 { claimed / noise } else { 1.0 };
+    let variance = noise / independent_pixels + extrapolation;
     let fit = Fit {
         target: projected_mean + displacement,
         displacement,
-        variance: noise / independent_pixels + extrapolation + settings.noise_floor.powi(2),
+        variance: variance + settings.noise_floor.powi(2),
+        claimed_variance: variance * claimed_share + settings.noise_floor.powi(2),
         gradient,
         gradient_covariance,
     };
@@ -141,6 +146,7 @@ impl Fit {
     fn is_finite(&self) -> bool {
         self.target.is_finite()
             && self.variance.is_finite()
+            && self.claimed_variance.is_finite()
             && self.gradient.is_finite()
             && self.gradient_covariance.is_finite()
     }

@@ -13,13 +13,15 @@ use crate::{cameras::Camera, gaussians::Gaussians};
 type Matrix6 = SMatrix<f64, 6, 6>;
 type Vector6 = SVector<f64, 6>;
 
-/// Gauss-Newton steps on the rigid motion; a rotation of 180° takes about six.
-const STEPS: usize = 10;
+/// Most Gauss-Newton steps on the rigid motion; a small rotation takes about six, half a turn ten.
+const STEPS: usize = 16;
 /// Longest step, radians: keeps the linearisation honest.
 const LONGEST_STEP: f64 = 0.7;
-/// Strain at which a neighbour stops counting as part of the same body, at the first and from the fourth step:
-/// a body that turns must not shed its members before the turn is found.
+/// Strain at which a neighbour stops counting as part of the same body. The next stage starts when a step turns by less
+/// than `SETTLED`: a body that turns must not shed its members before the turn is found.
 const BODY_STRAIN: [f64; 4] = [2.0, 1.0, 0.5, 0.25];
+/// Radians.
+const SETTLED: f64 = 0.2;
 /// Relative error of a footprint's affine motion along a Gaussian's axis as thick as its thinnest: how much of the axis lies
 /// out of the tracked surface.
 const OFF_SURFACE: f64 = 0.3;
@@ -54,7 +56,7 @@ pub(super) struct TurnedAxis {
 pub(super) struct RigidMotion {
     /// Displacement of the centre.
     pub translation: DVec3,
-    /// Identity unless significant.
+    /// The identity unless significant.
     pub rotation: DQuat,
 }
 
@@ -62,8 +64,8 @@ pub(super) struct RigidMotion {
 ///
 /// Both sources meet in one least-squares problem on SE(3), so that each direction of rotation comes from whichever
 /// knows it better. Members that do not move with the rest are shed by redescending weights on their strain. The
-/// rotation is the identity unless it exceeds `rotation_significance` of its standard deviations, where the deviations grow with
-/// the misfit. `start` is the translation from which members are judged first.
+/// rotation is shrunk by its significance (positive-part James-Stein), where its deviation grows with the misfit:
+/// noise alone turns nothing. `start` is the translation from which members are judged first.
 pub(super) fn fit_rigid_motion(
     members: &[Member],
     axes: &[TurnedAxis],
@@ -73,8 +75,9 @@ pub(super) fn fit_rigid_motion(
 ) -> RigidMotion {
     let unturned = RigidMotion { translation: start, rotation: DQuat::IDENTITY };
     let mut motion = unturned;
-    let mut system = System::new(members, axes, &motion, BODY_STRAIN[0], spacing, settings);
-    for step in 1..=STEPS {
+    let mut stage = 0;
+    let mut system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
+    for _ in 0..STEPS {
         let Some(increment) = system.solve() else { return unturned };
         let translation = DVec3::new(increment[0], increment[1], increment[2]);
         let turn = DVec3::new(increment[3], increment[4], increment[5]).clamp_length_max(LONGEST_STEP);
@@ -83,17 +86,21 @@ pub(super) fn fit_rigid_motion(
         }
         motion.translation += translation;
         motion.rotation = (DQuat::from_scaled_axis(turn) * motion.rotation).normalize();
-        let strain = BODY_STRAIN[step.min(BODY_STRAIN.len() - 1)];
-        system = System::new(members, axes, &motion, strain, spacing, settings);
-        if step >= BODY_STRAIN.len() && turn.length() < 1e-9 && translation.length() <= 1e-9 * spacing {
+        let is_last_stage = stage + 1 == BODY_STRAIN.len();
+        let has_converged = turn.length() < 1e-8 && translation.length() <= 1e-8 * spacing;
+        if turn.length() < SETTLED && !is_last_stage {
+            stage += 1;
+        }
+        system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
+        if is_last_stage && has_converged {
             break;
         }
     }
     let turn = motion.rotation.to_scaled_axis();
-    let is_significant = system
-        .rotation_information()
-        .is_some_and(|information| turn.dot(information * turn) > settings.rotation_significance.powi(2));
-    if is_significant { motion } else { RigidMotion { rotation: DQuat::IDENTITY, ..motion } }
+    let chi_squared = system.rotation_information().map_or(0.0, |information| turn.dot(information * turn));
+    let kept = 1.0 - settings.rotation_significance.powi(2) / chi_squared.max(f64::MIN_POSITIVE);
+    let rotation = if kept > 0.0 { DQuat::from_scaled_axis(turn * kept) } else { DQuat::IDENTITY };
+    RigidMotion { rotation, ..motion }
 }
 
 /// Normal equations of the increments of translation and rotation vector.

@@ -19,8 +19,8 @@ pub struct MotionSettings {
     /// Least determinant of a footprint's covariance, in normalised device coordinates, for an affine fit; below it only
     /// the translation is fitted. Default 1e-12, as in the public code (0.06 px² at 640×360).
     pub min_determinant: f64,
-    /// Least visible share of a footprint's blending weight, 0 to 1; default 0.3. Below it the visible rim says little about
-    /// the rest.
+    /// Least visible share of a footprint's blending weight, 0 to 1; default 0.6. Where most of
+    /// it vanishes, what remains is likely another surface at its rim.
     pub min_visible_share: f64,
     /// Least mean transmittance before a Gaussian, relative to the view that sees it best, 0 to 1; default 0.1. Pixels in front of
     /// a hidden Gaussian track its occluder.
@@ -38,22 +38,22 @@ pub struct MotionSettings {
     pub noise_floor: f64,
     /// Displacement, px, below which a footprint does not move whatever the noise; default 0.2, as in the public code.
     pub static_floor: f64,
-    /// Displacement over its standard deviation below which a footprint does not move; default 3.5 (0.2 % of
-    /// resting footprints exceed it).
+    /// Displacement over the standard deviation that the tracks claim below which a footprint does not move; default 3 (1 % of
+    /// resting footprints exceed it, and most views of one must).
     pub static_significance: f64,
-    /// Share of the observing views, weighted by their information, that must find a Gaussian at rest; default 0.5.
+    /// Share of the observing views, weighted by how well they see it, that must find a Gaussian at rest; default 0.5.
     pub static_share: f64,
     /// Reprojection error over its standard deviation beyond which a view is an outlier; default 4.
     pub outlier_significance: f64,
     /// Reprojection error, px, that is never an outlier; default 1: a Gaussian's mean lies off the tracked surface.
     pub outlier_floor: f64,
-    /// Largest standard deviation of a solved position, as a share of its depth; default 0.02. Beyond it the
-    /// neighbours decide.
+    /// Largest standard deviation of a solved position, as a share of its depth; default 0.005. Beyond it the
+    /// neighbours decide: footprints that straddle two motions know neither.
     pub max_relative_deviation: f64,
     /// Expected rotation, standard deviation in radians; default 1. Ties weakly determined rotations to none.
     pub expected_rotation: f64,
-    /// Rotation over its standard deviation below which a Gaussian does not turn; default 4 (0.1 % of unturned ones
-    /// exceed it in three dimensions).
+    /// Rotation over its standard deviation below which a Gaussian does not turn; larger rotations shrink by the same share of their
+    /// square. Default 3 (3 % of unturned Gaussians exceed it in three dimensions).
     pub rotation_significance: f64,
     /// Nearest neighbours per Gaussian; default 12, `draft` 8 (the paper's).
     pub neighbours: usize,
@@ -61,7 +61,8 @@ pub struct MotionSettings {
     pub max_edge: f64,
     /// Expected departure of neighbours from moving as one rigid body, as a share of their distance; default 0.1.
     pub neighbour_strain: f64,
-    /// Colour difference between neighbours that halves their tie, sRGB 0 to 1; default 0.15.
+    /// Colour difference between neighbours that halves their tie, as a distance in the sRGB cube; default 0.4, because
+    /// texture differs within a body too.
     pub colour_scale: f64,
     /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 4. Few wrong seeds must not
     /// spread far.
@@ -88,24 +89,24 @@ impl MotionSettings {
             min_blend_weight: 1e-3,
             min_pixels: 2,
             min_determinant: 1e-12,
-            min_visible_share: 0.3,
+            min_visible_share: 0.6,
             min_relative_transmittance: 0.1,
             min_views: 2,
             expected_strain: 0.3,
             noise_correlation_area: 16.0,
             noise_floor: 0.05,
             static_floor: 0.2,
-            static_significance: 3.5,
+            static_significance: 3.0,
             static_share: 0.5,
             outlier_significance: 4.0,
             outlier_floor: 1.0,
-            max_relative_deviation: 0.02,
+            max_relative_deviation: 0.005,
             expected_rotation: 1.0,
-            rotation_significance: 4.0,
+            rotation_significance: 3.0,
             neighbours: if is_draft { 8 } else { 12 },
             max_edge: 4.0,
             neighbour_strain: 0.1,
-            colour_scale: 0.15,
+            colour_scale: 0.4,
             max_hops: 4,
             min_support: 3,
             field_rounds: if is_draft { 2 } else { 3 },

@@ -2,20 +2,21 @@
 
 use super::{MotionSettings, observe::Observation};
 
-/// Whether the views that see a Gaussian find it at rest, by a majority weighted with their information.
+/// Whether most of the views that see a Gaussian find it at rest.
 ///
-/// A footprint is at rest in a view if its displacement is insignificant against its own standard deviation, or
-/// below an absolute floor. A view too noisy to tell finds everything at rest, but then has little weight.
+/// A footprint is at rest in a view if its displacement is insignificant against the noise that the tracks claim, or
+/// below an absolute floor. Noise that only the residual reveals is no excuse: a footprint of two motions moves. A view
+/// votes by the share of the Gaussian that it sees and by the sharpness of what it sees.
 pub(super) fn is_at_rest(observations: &[Observation], settings: &MotionSettings) -> bool {
     let (mut at_rest, mut all) = (0.0, 0.0);
-    for Observation { fit, .. } in observations {
-        let weight = 1.0 / (fit.variance + settings.static_floor.powi(2)).max(f64::MIN_POSITIVE);
+    for Observation { fit, transmittance, .. } in observations {
+        let sharpness = 1.0 / (fit.claimed_variance + settings.static_floor.powi(2)).max(f64::MIN_POSITIVE);
         let squared = fit.displacement.length_squared();
-        let insignificant = squared <= settings.static_significance.powi(2) * fit.variance;
+        let insignificant = squared <= settings.static_significance.powi(2) * fit.claimed_variance;
         if insignificant || squared <= settings.static_floor.powi(2) {
-            at_rest += weight;
+            at_rest += sharpness * transmittance;
         }
-        all += weight;
+        all += sharpness * transmittance;
     }
     all > 0.0 && at_rest > settings.static_share * all
 }
