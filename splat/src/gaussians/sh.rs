@@ -66,10 +66,11 @@ pub fn basis_f32(direction: [f32; 3], degree: u32) -> [f32; 16] {
     evaluate_basis!(f32, direction, degree)
 }
 
-/// Rotates a function on the sphere: afterwards it has at `rotation * direction` the value that it had at `direction`.
+/// Rotates a function on the sphere: afterwards it has at `rotation * direction` the value that it had at
+/// `direction`.
 ///
-/// `coefficients` is `K × 3`, coefficient by channel, with `K` = 1, 4, 9 or 16. The rotation must be a unit quaternion.
-/// A slice of another length than `K × 3` keeps what lies beyond the last complete band.
+/// `coefficients` is `K × 3`, coefficient by channel, with `K` = 1, 4, 9 or 16. The rotation must be a unit
+/// quaternion. A slice of another length than `K × 3` keeps what lies beyond the last complete band.
 pub fn rotate(coefficients: &mut [f32], rotation: DQuat) {
     let bands = BandRotation::new(rotation, degree_of(coefficients.len() / 3));
     bands.apply(coefficients);
@@ -106,13 +107,15 @@ const DIRECTIONS: [[f64; 3]; 13] = [
     [1.0, -1.0, -1.0],
 ];
 
-/// Weight of an antipodal pair with 1, 2 or 3 nonzero coordinates (V. I. Lebedev, 1976); they sum to one over the rule.
+/// Weight of an antipodal pair with 1, 2 or 3 nonzero coordinates (V. I. Lebedev, 1976); they sum to one over
+/// the rule.
 const PAIR_WEIGHTS: [f64; 3] = [2.0 / 21.0, 8.0 / 105.0, 18.0 / 280.0];
 
 impl BandRotation {
     /// Projects the rotated basis functions on the basis by quadrature.
     ///
-    /// The products are polynomials of degree at most 6 and even under inversion, for which the rule is exact.
+    /// The products are polynomials of degree at most 6 and even under inversion, for which the rule is
+    /// exact.
     fn new(rotation: DQuat, degree: u32) -> Self {
         let mut matrix = [[0.0; 16]; 16];
         matrix[0][0] = 1.0;

@@ -8,7 +8,8 @@ use crate::gaussians::{Gaussians, sh};
 
 /// The Gaussians after a motion: means moved, rotations composed, spherical harmonics rotated with them.
 ///
-/// Scales and opacities stay, and so does the norm of each stored quaternion. A Gaussian without motion keeps its bytes.
+/// Scales and opacities stay, and so does the norm of each stored quaternion. A Gaussian without motion keeps
+/// its bytes.
 pub fn apply(gaussians: &Gaussians, field: &MotionField) -> Gaussians {
     let mut moved = gaussians.clone();
     for (index, translation) in field.translation.iter().enumerate().take(moved.len()) {

@@ -4,6 +4,9 @@ use glam::{DMat2, DVec2};
 
 use super::{MotionSettings, moments::FootprintMoments};
 
+/// An expected strain of zero asks for translations only; this is as good and keeps the ridge finite.
+const LEAST_STRAIN: f64 = 1e-6;
+
 /// How a footprint moves: `x ↦ target + gradient · (x − m)` about the projected mean `m`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Fit {
@@ -24,8 +27,8 @@ pub(super) struct Fit {
 /// Fits the footprint's motion and evaluates it at the Gaussian's own projected mean.
 ///
 /// The affine part is the posterior mean under `A ~ I ± expected_strain`, which equals a ridge of
-/// `noise² / (pixels · strain²)` on the footprint's covariance: small footprints come out as translations. `None`
-/// where the footprint does not count as observed.
+/// `noise² / (pixels · strain²)` on the footprint's covariance: small footprints come out as translations.
+/// `None` where the footprint does not count as observed.
 pub(super) fn fit(
     moments: &FootprintMoments,
     projected_mean: DVec2,
@@ -40,7 +43,8 @@ pub(super) fn fit(
     let independent_pixels =
         1.0 + (footprint.pixels - 1.0).max(0.0) / settings.noise_correlation_area.max(1.0);
 
-    // The tracker's own variance sets the first ridge; the residual may then reveal more noise than it claims.
+    // The tracker's own variance sets the first ridge; the residual may then reveal more noise than it
+    // claims.
     let claimed = footprint.track_variance;
     let first = footprint.gradient(is_affine, ridge(claimed, independent_pixels, settings));
     let noise = claimed.max(footprint.residual_variance(first));
@@ -82,7 +86,7 @@ fn is_observed(moments: &FootprintMoments, settings: &MotionSettings) -> bool {
 }
 
 fn ridge(noise: f64, pixels: f64, settings: &MotionSettings) -> f64 {
-    noise / (pixels * settings.expected_strain.powi(2)).max(f64::MIN_POSITIVE)
+    noise / (pixels * settings.expected_strain.max(LEAST_STRAIN).powi(2))
 }
 
 /// Moments divided by the weight.
@@ -128,12 +132,14 @@ impl Footprint {
         DMat2::IDENTITY + (self.cross - self.source) * regularised.inverse()
     }
 
-    /// Unbiased variance per axis of what `gradient` leaves unexplained; zero where nothing is left to estimate it from.
+    /// Unbiased variance per axis of what `gradient` leaves unexplained; zero where nothing is left to
+    /// estimate it from.
     fn residual_variance(&self, gradient: DMat2) -> f64 {
         let explained = 2.0 * trace(gradient * self.cross.transpose());
         let model = trace(gradient * self.source * gradient.transpose());
         let per_axis = 0.5 * (self.target_power - explained + model).max(0.0);
-        // Three parameters per axis; the floor of one keeps tiny footprints from inflating their own residual.
+        // Three parameters per axis; the floor of one keeps tiny footprints from inflating their own
+        // residual.
         per_axis * self.pixels / (self.pixels - 3.0).max(1.0)
     }
 }

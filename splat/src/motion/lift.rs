@@ -7,7 +7,8 @@ use crate::cameras::Camera;
 
 /// Most Gauss-Newton steps; convergence is quadratic from the rays' intersection, so few are ever taken.
 const STEPS: usize = 8;
-/// Residual, in standard deviations, from which a view's pull stops growing (95 % efficient for normal noise).
+/// Residual, in standard deviations, from which a view's pull stops growing (95 % efficient for normal
+/// noise).
 const HUBER: f64 = 1.345;
 /// Most pairs of views that are tried as a consistent core.
 const MAX_PAIRS: usize = 66;
@@ -30,14 +31,16 @@ pub(super) struct Lift {
     pub information: DMat3,
     /// Sightings that agree with the solution, by their index in the input.
     pub inliers: Vec<usize>,
-    /// Whether the views alone determine the position; otherwise neighbours must supply the missing directions.
+    /// Whether the views alone determine the position; otherwise neighbours must supply the missing
+    /// directions.
     pub is_determined: bool,
 }
 
 /// Triangulates a displaced mean by Gauss-Newton on pixels, robust to views whose track is wrong.
 ///
 /// If not all views agree, the largest set around a consistent pair of views does (exhaustive RANSAC). `None`
-/// if no set of more than half of the views agrees, or if the position is behind a camera that claims to see it.
+/// if no set of more than half of the views agrees, or if the position is behind a camera that claims to see
+/// it.
 pub(super) fn solve(sightings: &[Sighting<'_>], mean: DVec3, settings: &MotionSettings) -> Option<Lift> {
     let problem = Problem { sightings, mean, settings };
     let everyone: Vec<usize> = (0..sightings.len()).collect();
@@ -73,8 +76,8 @@ impl Problem<'_> {
         Some(self.refine(start, members))
     }
 
-    /// Precision of the prior that nothing moves farther than its distance from the nearest camera: far below that
-    /// of any track, it only decides directions that no view sees.
+    /// Precision of the prior that nothing moves farther than its distance from the nearest camera: far below
+    /// that of any track, it only decides directions that no view sees.
     fn prior_precision(&self, members: &[usize]) -> f64 {
         let nearest = members
             .iter()
@@ -108,7 +111,8 @@ impl Problem<'_> {
         members.iter().all(|&m| self.sightings[m].camera.project_world(position).is_some())
     }
 
-    /// Gauss-Newton with Huber weights; a step is halved until it lowers the cost and stays in front of the cameras.
+    /// Gauss-Newton with Huber weights; a step is halved until it lowers the cost and stays in front of the
+    /// cameras.
     fn refine(&self, start: DVec3, members: &[usize]) -> DVec3 {
         let mut position = start;
         let mut cost = self.cost(position, members);
@@ -220,7 +224,8 @@ impl Problem<'_> {
     }
 }
 
-/// Whether every eigenvalue of a symmetric matrix exceeds `bound`: whether what remains after taking it away is positive definite.
+/// Whether every eigenvalue of a symmetric matrix exceeds `bound`: whether what remains after taking it away
+/// is positive definite.
 fn is_above(matrix: DMat3, bound: f64) -> bool {
     let rest = (matrix - DMat3::from_diagonal(DVec3::splat(bound))) * (1.0 / bound);
     let leading = rest.x_axis.x * rest.y_axis.y - rest.x_axis.y * rest.y_axis.x;

@@ -11,7 +11,8 @@
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
 //!
-//! Solves run in double precision; sums are in index order, so that the result does not depend on the number of threads.
+//! Solves run in double precision; sums are in index order, so that the result does not depend on the number
+//! of threads.
 
 mod apply;
 mod fit2d;
@@ -84,7 +85,8 @@ pub struct MotionView {
 /// Motion of every Gaussian of the static model to the frame that the tracks lead to.
 ///
 /// # Errors
-/// [`EngineError::InvalidInput`] if tracks and camera of a view differ in size; otherwise whatever the engine reports.
+/// [`EngineError::InvalidInput`] if tracks and camera of a view differ in size; otherwise whatever the engine
+/// reports.
 pub fn estimate(
     engine: &dyn Engine,
     gaussians: &Gaussians,

@@ -69,7 +69,7 @@ fn observation(
     moments: &FootprintMoments,
     settings: &MotionSettings,
 ) -> Option<(Fit, f64)> {
-    if !(moments.blend_weight > 0.0) {
+    if moments.blend_weight.is_nan() || moments.blend_weight <= 0.0 {
         return None;
     }
     let position = camera.to_camera(gaussians.mean(index));
@@ -90,8 +90,8 @@ fn observation(
     transmittance.is_finite().then_some((fit, transmittance))
 }
 
-/// Drops views that hardly see the Gaussian and trusts the others by how well they see it, relative to the best:
-/// a pixel in front of a hidden Gaussian tracks its occluder.
+/// Drops views that hardly see the Gaussian and trusts the others by how well they see it, relative to the
+/// best: a pixel in front of a hidden Gaussian tracks its occluder.
 fn trust_unoccluded(observations: &mut Vec<Observation>, settings: &MotionSettings) {
     let best = observations.iter().map(|o| o.transmittance).fold(0.0, f64::max);
     observations.retain(|o| o.transmittance >= settings.min_relative_transmittance * best && best > 0.0);

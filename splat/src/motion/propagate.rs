@@ -17,7 +17,8 @@ pub(super) struct State {
     pub origin: MotionOrigin,
     pub translation: DVec3,
     pub rotation: DQuat,
-    /// What its own footprints say: of a solved Gaussian everything, of another the directions that were seen.
+    /// What its own footprints say: of a solved Gaussian everything, of another the directions that were
+    /// seen.
     pub own: Option<Lift>,
 }
 
@@ -104,8 +105,8 @@ struct Consensus {
     members: Vec<Neighbour>,
 }
 
-/// Takes back solutions that only two views support and that a majority of the neighbours contradicts: a track
-/// that is wrong along the epipolar line passes every test of its own.
+/// Takes back solutions that only two views support and that a majority of the neighbours contradicts: a
+/// track that is wrong along the epipolar line passes every test of its own.
 pub(super) fn retract_unverified(states: &mut [State], context: &Context<'_>) {
     let snapshot: &[State] = states;
     let retracted: Vec<usize> = (0..snapshot.len())
@@ -142,8 +143,8 @@ fn deviation(state: &State) -> f64 {
 
 /// Fills unsolved Gaussians from agreeing neighbours, one ring of neighbours per hop.
 ///
-/// Each hop reads the states before it, so that the result does not depend on the order of the Gaussians. Where too few
-/// neighbours agree the Gaussian stays unsolved.
+/// Each hop reads the states before it, so that the result does not depend on the order of the Gaussians.
+/// Where too few neighbours agree the Gaussian stays unsolved.
 pub(super) fn propagate(states: &mut [State], context: &Context<'_>) {
     for _ in 0..context.settings.max_hops {
         let snapshot: &[State] = states;

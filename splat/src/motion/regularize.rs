@@ -10,19 +10,20 @@ use super::{
 
 /// Strain beyond which an edge crosses a motion boundary and lets go.
 const BOUNDARY_STRAIN: f64 = 0.25;
-/// Tie between a moving and a resting Gaussian, relative to one between two moving ones: most such edges cross a boundary,
-/// but the foot of a bending pole does not.
+/// Tie between a moving and a resting Gaussian, relative to one between two moving ones: most such edges
+/// cross a boundary, but the foot of a bending pole does not.
 const REST_AFFINITY: f64 = 0.1;
 /// Squared residual norm, relative to the first, at which conjugate gradients stop.
 const RELATIVE_RESIDUAL: f64 = 1e-16;
 
 /// Replaces the translations of moving Gaussians by the minimum of
-/// `Σ (d−d̂)ᵀ H (d−d̂) + Σ λ_ij |d_i − d_j − r_ij|²`, where `r_ij` is what the rotations of both ends say about their
-/// difference.
+/// `Σ (d−d̂)ᵀ H (d−d̂) + Σ λ_ij |d_i − d_j − r_ij|²`, where `r_ij` is what the rotations of both ends say about
+/// their difference.
 ///
-/// `λ_ij` is the precision of a neighbour's prediction, `1 / (neighbour_strain · distance)²`, times the colour affinity
-/// and a redescending weight that stops the field at motion boundaries. Gaussians at rest stay at rest and anchor
-/// their neighbours. Each round is solved by block-Jacobi conjugate gradients with a bounded number of steps; all sums are in index order.
+/// `λ_ij` is the precision of a neighbour's prediction, `1 / (neighbour_strain · distance)²`, times the
+/// colour affinity and a redescending weight that stops the field at motion boundaries. Gaussians at rest
+/// stay at rest and anchor their neighbours. Each round is solved by block-Jacobi conjugate gradients with a
+/// bounded number of steps; all sums are in index order.
 pub(super) fn regularize(states: &mut [State], context: &Context<'_>) {
     let moving: Vec<usize> = (0..states.len())
         .filter(|&i| matches!(states[i].origin, MotionOrigin::Solved | MotionOrigin::Propagated))
@@ -149,12 +150,12 @@ impl System {
         let mut power = dot(&residual, &direction);
         let enough = RELATIVE_RESIDUAL * power;
         for _ in 0..steps {
-            if !(power > enough) {
+            if power.is_nan() || power <= enough {
                 break;
             }
             let image = self.times(&direction);
             let curvature = dot(&direction, &image);
-            if !(curvature > 0.0) {
+            if curvature.is_nan() || curvature <= 0.0 {
                 break;
             }
             let length = power / curvature;

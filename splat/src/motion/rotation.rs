@@ -1,7 +1,6 @@
 //! How a Gaussian turns: from its neighbours' displacements and from its own footprints' deformation.
 
 use glam::{DMat3, DQuat, DVec3};
-use nalgebra::{SMatrix, SVector};
 
 use super::{
     MotionSettings,
@@ -10,20 +9,17 @@ use super::{
 };
 use crate::{cameras::Camera, gaussians::Gaussians};
 
-type Matrix6 = SMatrix<f64, 6, 6>;
-type Vector6 = SVector<f64, 6>;
-
 /// Most Gauss-Newton steps on the rigid motion; a small rotation takes about six, half a turn ten.
 const STEPS: usize = 16;
 /// Longest step, radians: keeps the linearisation honest.
 const LONGEST_STEP: f64 = 0.7;
-/// Strain at which a neighbour stops counting as part of the same body. The next stage starts when a step turns by less
-/// than `SETTLED`: a body that turns must not shed its members before the turn is found.
+/// Strain at which a neighbour stops counting as part of the same body. The next stage starts when a step
+/// turns by less than `SETTLED`: a body that turns must not shed its members before the turn is found.
 const BODY_STRAIN: [f64; 4] = [2.0, 1.0, 0.5, 0.25];
 /// Radians.
 const SETTLED: f64 = 0.2;
-/// Relative error of a footprint's affine motion along a Gaussian's axis as thick as its thinnest: how much of the axis lies
-/// out of the tracked surface.
+/// Relative error of a footprint's affine motion along a Gaussian's axis as thick as its thinnest: how much
+/// of the axis lies out of the tracked surface.
 const OFF_SURFACE: f64 = 0.3;
 /// The same for an infinitely thin Gaussian: the footprint is small but not infinitesimal.
 const LEAST_AXIS_ERROR: f64 = 1e-3;
@@ -62,10 +58,11 @@ pub(super) struct RigidMotion {
 
 /// Fits `d_j ≈ t + (R − I) x_j` to the members and `y_k ≈ R q_k` to the axes, each by its information.
 ///
-/// Both sources meet in one least-squares problem on SE(3), so that each direction of rotation comes from whichever
-/// knows it better. Members that do not move with the rest are shed by redescending weights on their strain. The
-/// rotation is shrunk by its significance (positive-part James-Stein), where its deviation grows with the misfit:
-/// noise alone turns nothing. `start` is the translation from which members are judged first.
+/// Both sources meet in one least-squares problem on SE(3), so that each direction of rotation comes from
+/// whichever knows it better. Members that do not move with the rest are shed by redescending weights on
+/// their strain. The rotation is shrunk by its significance (positive-part James-Stein), where its deviation
+/// grows with the misfit: noise alone turns nothing. `start` is the translation from which members are judged
+/// first.
 pub(super) fn fit_rigid_motion(
     members: &[Member],
     axes: &[TurnedAxis],
@@ -78,9 +75,8 @@ pub(super) fn fit_rigid_motion(
     let mut stage = 0;
     let mut system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
     for _ in 0..STEPS {
-        let Some(increment) = system.solve() else { return unturned };
-        let translation = DVec3::new(increment[0], increment[1], increment[2]);
-        let turn = DVec3::new(increment[3], increment[4], increment[5]).clamp_length_max(LONGEST_STEP);
+        let (translation, turn) = system.solve();
+        let turn = turn.clamp_length_max(LONGEST_STEP);
         if !(translation.is_finite() && turn.is_finite()) {
             return unturned;
         }
@@ -103,14 +99,21 @@ pub(super) fn fit_rigid_motion(
     RigidMotion { rotation, ..motion }
 }
 
-/// Normal equations of the increments of translation and rotation vector.
+/// Normal equations of the increments of translation and rotation vector, by 3×3 blocks.
+#[derive(Default)]
 struct System {
-    normal: Matrix6,
-    right: Vector6,
+    /// Translation by translation.
+    translation: DMat3,
+    /// Translation by rotation.
+    coupling: DMat3,
+    /// Rotation by rotation, without the prior.
+    rotation: DMat3,
+    force: DVec3,
+    torque: DVec3,
+    prior: f64,
     chi_squared: f64,
     /// Number of residuals, counted with their robust weights, less the six unknowns.
     freedom: f64,
-    prior: f64,
 }
 
 impl System {
@@ -124,91 +127,69 @@ impl System {
     ) -> Self {
         let turn = DMat3::from_quat(motion.rotation);
         let prior = settings.expected_rotation.powi(2).max(f64::MIN_POSITIVE).recip();
-        let mut system = Self {
-            normal: Matrix6::zeros(),
-            right: Vector6::zeros(),
-            chi_squared: 0.0,
-            freedom: -6.0,
-            prior,
-        };
+        let torque = motion.rotation.to_scaled_axis() * -prior;
+        let mut system = Self { prior, torque, freedom: -6.0, ..Self::default() };
         for member in members {
             let lever = turn * member.offset;
             let residual = member.translation - motion.translation - (lever - member.offset);
             let tolerance = body_strain * (member.offset.length() + 0.1 * spacing).max(f64::MIN_POSITIVE);
             let misfit = residual.length_squared() / (tolerance * tolerance);
             let weight = member.affinity / (1.0 + misfit).powi(2);
-            system.add(DMat3::IDENTITY, -cross_matrix(lever), member.information, residual, weight);
+            let information = member.information * weight;
+            let coupling = system.add_rotation(lever, information, residual, weight);
+            system.translation += information;
+            system.coupling += coupling;
+            system.force += information * residual;
         }
         for axis in axes {
             let turned = turn * axis.from;
-            system.add(DMat3::ZERO, -cross_matrix(turned), axis.information, axis.to - turned, 1.0);
-        }
-        let rotation = motion.rotation.to_scaled_axis();
-        for axis in 0..3 {
-            system.normal[(3 + axis, 3 + axis)] += prior;
-            system.right[3 + axis] -= prior * rotation[axis];
+            system.add_rotation(turned, axis.information, axis.to - turned, 1.0);
         }
         system
     }
 
-    /// Adds a residual that falls by `by_translation · δt + by_rotation · δω`.
-    fn add(
-        &mut self,
-        by_translation: DMat3,
-        by_rotation: DMat3,
-        information: DMat3,
-        residual: DVec3,
-        weight: f64,
-    ) {
-        let information = information * weight;
-        let (force, blocks) = (information * residual, [by_translation, by_rotation]);
-        for (row, left) in blocks.iter().enumerate() {
-            let pull = left.transpose() * force;
-            for (column, right) in blocks.iter().enumerate() {
-                let block = left.transpose() * information * *right;
-                for r in 0..3 {
-                    for c in 0..3 {
-                        self.normal[(3 * row + r, 3 * column + c)] += block.col(c)[r];
-                    }
-                }
-            }
-            for r in 0..3 {
-                self.right[3 * row + r] += pull[r];
-            }
-        }
+    /// Adds a residual that falls by `δω × lever`; gives the block that couples it to its translation.
+    fn add_rotation(&mut self, lever: DVec3, information: DMat3, residual: DVec3, weight: f64) -> DMat3 {
+        let by_rotation = -cross_matrix(lever);
+        let force = information * residual;
+        let coupling = information * by_rotation;
+        self.rotation += by_rotation.transpose() * coupling;
+        self.torque += lever.cross(force);
         self.chi_squared += residual.dot(force);
-        // A singular information matrix observes fewer than three components; counting all of them only lowers the
-        // estimated misfit where it is ill determined anyway.
+        // A singular information matrix observes fewer than three components; counting all of them only
+        // lowers the estimated misfit where it is ill determined anyway.
         self.freedom += 3.0 * weight;
+        coupling
     }
 
-    /// Solves after scaling to a unit diagonal: translations and rotations have different units.
-    fn solve(&self) -> Option<Vector6> {
-        let scale = self.normal.diagonal().map(|d| 1.0 / d.max(f64::MIN_POSITIVE).sqrt());
-        let mut scaled = Matrix6::from_fn(|r, c| self.normal[(r, c)] * scale[r] * scale[c]);
-        for axis in 0..6 {
-            scaled[(axis, axis)] += 1e-12;
+    /// Inverse of the translation block; a tiny share of its trace stands in where no member sees a
+    /// direction.
+    fn translation_covariance(&self) -> DMat3 {
+        let trace = self.translation.diagonal().element_sum();
+        if !trace.is_normal() {
+            return DMat3::ZERO;
         }
-        let solution = scaled.cholesky()?.solve(&self.right.component_mul(&scale));
-        Some(solution.component_mul(&scale))
+        (self.translation + DMat3::from_diagonal(DVec3::splat(1e-12 * trace))).inverse()
     }
 
-    /// Inverse covariance of the rotation vector once the translation is free: the Schur complement without the prior,
-    /// divided by the misfit.
+    /// The rotation block once the translation is free (Schur complement), without the prior.
+    fn free_rotation(&self) -> DMat3 {
+        self.rotation - self.coupling.transpose() * self.translation_covariance() * self.coupling
+    }
+
+    /// Increments of translation and rotation vector.
+    fn solve(&self) -> (DVec3, DVec3) {
+        let covariance = self.translation_covariance();
+        let torque = self.torque - self.coupling.transpose() * covariance * self.force;
+        let stiffness = self.free_rotation() + DMat3::from_diagonal(DVec3::splat(self.prior));
+        let turn = stiffness.inverse() * torque;
+        (covariance * (self.force - self.coupling * turn), turn)
+    }
+
+    /// Inverse covariance of the rotation vector, divided by the misfit.
     fn rotation_information(&self) -> Option<DMat3> {
-        let block = |row: usize, column: usize| {
-            DMat3::from_cols_array(&std::array::from_fn(|k| self.normal[(row + k % 3, column + k / 3)]))
-        };
-        let of_rotation = block(3, 3) - DMat3::from_diagonal(DVec3::splat(self.prior));
-        let of_translation = block(0, 0);
-        let coupling = block(0, 3);
-        let free = if of_translation == DMat3::ZERO {
-            of_rotation
-        } else {
-            of_rotation - coupling.transpose() * of_translation.inverse() * coupling
-        };
         let misfit = if self.freedom > 0.0 { (self.chi_squared / self.freedom).max(1.0) } else { 1.0 };
-        let information = free * misfit.recip();
+        let information = self.free_rotation() * misfit.recip();
         information.is_finite().then_some(information)
     }
 }
@@ -220,12 +201,12 @@ pub(super) struct Deformation<'a> {
     pub fit: &'a Fit,
 }
 
-/// Lifts the footprints' deformation to the Gaussian's axes: `T' F q ≈ A T q` for the deformation gradient `F`, with the
-/// Jacobian `T` at the old and `T'` at the new mean.
+/// Lifts the footprints' deformation to the Gaussian's axes: `T' F q ≈ A T q` for the deformation gradient
+/// `F`, with the Jacobian `T` at the old and `T'` at the new mean.
 ///
-/// The relation holds for lines in the tracked surface only, so the thinnest axis takes no part, and an axis counts by how
-/// much it is longer than the thinnest: both major axes of a flat Gaussian, the long one of a needle, hardly any
-/// of a ball. Directions along which no view sees the axis turn stay as they were.
+/// The relation holds for lines in the tracked surface only, so the thinnest axis takes no part, and an axis
+/// counts by how much it is longer than the thinnest: both major axes of a flat Gaussian, the long one of a
+/// needle, hardly any of a ball. Directions along which no view sees the axis turn stay as they were.
 pub(super) fn lift_axes(
     gaussians: &Gaussians,
     index: usize,
@@ -260,7 +241,7 @@ fn lift_axis(
         let projected = glam::DVec2::new(u.dot(axis), v.dot(axis));
         let noise = projected.dot(fit.gradient_covariance * projected);
         let variance = noise + (off_surface * projected.length()).powi(2);
-        if !(variance > 0.0) {
+        if variance <= 0.0 || variance.is_nan() {
             continue;
         }
         let seen = fit.gradient * projected;

@@ -6,70 +6,77 @@ use crate::settings::Quality;
 
 /// How Gaussians are moved from tracks.
 ///
-/// Pixels are those of the track fields. The discard thresholds follow the paper and its public code where they are known
-/// there; the rest follow from the noise of dense trackers.
+/// Pixels are those of the track fields. The discard thresholds follow the paper and its public code where
+/// they are known there; the rest follow from the noise of dense trackers.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionSettings {
-    /// Least sum of blending weights `alpha * T` of a footprint that counts as observed in a view; default 1e-3, as in the
-    /// public code.
+    /// Least sum of blending weights `alpha * T` of a footprint that counts as observed in a view; default
+    /// 1e-3, as in the public code.
     pub min_blend_weight: f64,
-    /// Least number of visible pixels of a footprint that counts as observed; default 2, as in the public code.
+    /// Least number of visible pixels of a footprint that counts as observed; default 2, as in the public
+    /// code.
     pub min_pixels: u32,
-    /// Least determinant of a footprint's covariance, in normalised device coordinates, for an affine fit; below it only
-    /// the translation is fitted. Default 1e-12, as in the public code (0.06 px² at 640×360).
+    /// Least determinant of a footprint's covariance, in normalised device coordinates, for an affine fit;
+    /// below it only the translation is fitted. Default 1e-12, as in the public code (0.06 px² at 640×360).
     pub min_determinant: f64,
-    /// Least visible share of a footprint's blending weight, 0 to 1; default 0.6. Where most of
-    /// it vanishes, what remains is likely another surface at its rim.
+    /// Least visible share of a footprint's blending weight, 0 to 1; default 0.6. Where most of it vanishes,
+    /// what remains is likely another surface at its rim.
     pub min_visible_share: f64,
-    /// Least mean transmittance before a Gaussian, relative to the view that sees it best, 0 to 1; default 0.1. Pixels in front of
-    /// a hidden Gaussian track its occluder.
+    /// Least mean transmittance before a Gaussian, relative to the view that sees it best, 0 to 1; default
+    /// 0.1. Pixels in front of a hidden Gaussian track its occluder.
     pub min_relative_transmittance: f64,
-    /// Least number of views that a position is solved from; default 2, as in the paper. A single view still counts along the
-    /// directions it sees once neighbours give the depth.
+    /// Least number of views that a position is solved from; default 2, as in the paper. A single view still
+    /// counts along the directions it sees once neighbours give the depth.
     pub min_views: usize,
-    /// Expected change of a footprint's shape, standard deviation of `A - I`; default 0.3. Ties the affine fit of small or noisy
-    /// footprints to a translation.
+    /// Expected change of a footprint's shape, standard deviation of `A - I`; default 0.3. Ties the affine
+    /// fit of small or noisy footprints to a translation.
     pub expected_strain: f64,
-    /// Area over which track errors are alike, px², at least 1; default 16, the 4×4 px that dense trackers match on
-    /// after densification.
+    /// Area over which track errors are alike, px², at least 1; default 16, the 4×4 px that dense trackers
+    /// match on after densification.
     pub noise_correlation_area: f64,
     /// Standard deviation, px, of what no track sees: mixed surfaces and pixel rounding; default 0.05.
     pub noise_floor: f64,
-    /// Displacement, px, below which a footprint does not move whatever the noise; default 0.2, as in the public code.
+    /// Displacement, px, below which a footprint does not move whatever the noise; default 0.2, as in the
+    /// public code.
     pub static_floor: f64,
-    /// Displacement over the standard deviation that the tracks claim below which a footprint does not move; default 3 (1 % of
-    /// resting footprints exceed it, and most views of one must).
+    /// Displacement over the standard deviation that the tracks claim below which a footprint does not move;
+    /// default 3, which 1 % of resting footprints exceed; most views of a Gaussian must for it to count as moving.
     pub static_significance: f64,
-    /// Share of the observing views, weighted by how well they see it, that must find a Gaussian at rest; default 0.5.
+    /// Share of the observing views, weighted by how well they see it, that must find a Gaussian at rest;
+    /// default 0.5.
     pub static_share: f64,
     /// Reprojection error over its standard deviation beyond which a view is an outlier; default 4.
     pub outlier_significance: f64,
-    /// Reprojection error, px, that is never an outlier; default 1: a Gaussian's mean lies off the tracked surface.
+    /// Reprojection error, px, that is never an outlier; default 1: a Gaussian's mean lies off the tracked
+    /// surface.
     pub outlier_floor: f64,
     /// Largest standard deviation of a solved position, as a share of its depth; default 0.005. Beyond it the
     /// neighbours decide: footprints that straddle two motions know neither.
     pub max_relative_deviation: f64,
     /// Expected rotation, standard deviation in radians; default 1. Ties weakly determined rotations to none.
     pub expected_rotation: f64,
-    /// Rotation over its standard deviation below which a Gaussian does not turn; larger rotations shrink by the same share of their
-    /// square. Default 3 (3 % of unturned Gaussians exceed it in three dimensions).
+    /// Rotation over its standard deviation below which a Gaussian does not turn; larger rotations shrink by
+    /// the same share of their square. Default 3 (3 % of unturned Gaussians exceed it in three dimensions).
     pub rotation_significance: f64,
     /// Nearest neighbours per Gaussian; default 12, `draft` 8 (the paper's).
     pub neighbours: usize,
-    /// Longest edge between neighbours, in medians of the distance to the farthest of the nearest neighbours; default 4.
+    /// Longest edge between neighbours, in medians of the distance to the farthest of the nearest neighbours;
+    /// default 4.
     pub max_edge: f64,
-    /// Expected departure of neighbours from moving as one rigid body, as a share of their distance; default 0.1.
+    /// Expected departure of neighbours from moving as one rigid body, as a share of their distance; default
+    /// 0.1.
     pub neighbour_strain: f64,
-    /// Colour difference between neighbours that halves their tie, as a distance in the sRGB cube; default 0.4, because
-    /// texture differs within a body too.
+    /// Colour difference between neighbours that halves their tie, as a distance in the sRGB cube; default
+    /// 0.4, because texture differs within a body too.
     pub colour_scale: f64,
-    /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 4. Few wrong seeds must not
-    /// spread far.
+    /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 4. Few wrong
+    /// seeds must not spread far.
     pub max_hops: usize,
     /// Agreeing neighbours that an unobserved Gaussian needs to follow them; default 3.
     pub min_support: usize,
-    /// Rounds of robust reweighting of the neighbours' field; default 3, `draft` 2. Zero leaves the solved motions as they are.
+    /// Rounds of robust reweighting of the neighbours' field; default 3, `draft` 2. Zero leaves the solved
+    /// motions as they are.
     pub field_rounds: usize,
     /// Most steps of conjugate gradients per round; default 20.
     pub field_steps: usize,

@@ -4,9 +4,10 @@ use super::{MotionSettings, observe::Observation};
 
 /// Whether most of the views that see a Gaussian find it at rest.
 ///
-/// A footprint is at rest in a view if its displacement is insignificant against the noise that the tracks claim, or
-/// below an absolute floor. Noise that only the residual reveals is no excuse: a footprint of two motions moves. A view
-/// votes by the share of the Gaussian that it sees and by the sharpness of what it sees.
+/// A footprint is at rest in a view if its displacement is insignificant against the noise that the tracks
+/// claim, or below an absolute floor. Noise that only the residual reveals is no excuse: a footprint of two
+/// motions moves. A view votes by the share of the Gaussian that it sees and by the sharpness of what it
+/// sees.
 pub(super) fn is_at_rest(observations: &[Observation], settings: &MotionSettings) -> bool {
     let (mut at_rest, mut all) = (0.0, 0.0);
     for Observation { fit, transmittance, .. } in observations {

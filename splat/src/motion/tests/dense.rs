@@ -1,4 +1,5 @@
-//! A double-precision rasterizer that only measures footprints: every Gaussian against every pixel that it can reach.
+//! A double-precision rasterizer that only measures footprints: every Gaussian against every pixel that it
+//! can reach.
 
 use glam::{DMat2, DVec2, DVec3};
 
@@ -72,7 +73,7 @@ pub(super) fn weights(gaussians: &Gaussians, camera: &Camera) -> Vec<Blend> {
         let conic = footprint.inverse();
         let Some(centre) = camera.project(x) else { continue };
         let log_reach = (255.0 * gaussians.opacity(i)).ln();
-        if !(log_reach > 0.0) {
+        if log_reach <= 0.0 {
             continue;
         }
         let reach = |variance: f64| (2.0 * log_reach * variance).sqrt() + 1.0;
