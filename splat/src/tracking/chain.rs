@@ -32,26 +32,44 @@ pub(super) fn chain(to_earlier: &Judged, onward: &Judged) -> Judged {
     Judged { flow, visible, sigma }
 }
 
-/// Per pixel the candidate with the smallest standard deviation among the visible ones, the first of equals; where
-/// none is visible, the one with the smallest of all.
+/// Candidates closer than this support each other, pixels.
+const AGREE: f32 = 2.0;
+
+/// Per pixel the visible candidate that most others agree with, of those the one with the smallest standard
+/// deviation, of equals the first. Without a majority the doubt is added to its standard deviation: repetitive or
+/// plain texture matches well in wrong places too. Where no candidate is visible, the most certain one.
 pub(super) fn choose(candidates: &[Judged]) -> Judged {
     let mut chosen = candidates[0].clone();
-    for candidate in &candidates[1..] {
-        for i in 0..chosen.sigma.len() {
-            let better = match (candidate.visible[i], chosen.visible[i]) {
-                (true, false) => true,
-                (false, true) => false,
-                _ => candidate.sigma[i] < chosen.sigma[i],
-            };
-            if better {
-                chosen.flow.u[i] = candidate.flow.u[i];
-                chosen.flow.v[i] = candidate.flow.v[i];
-                chosen.visible[i] = candidate.visible[i];
-                chosen.sigma[i] = candidate.sigma[i];
-            }
-        }
+    for i in 0..chosen.sigma.len() {
+        let (candidate, doubt) = choose_at(candidates, i);
+        let candidate = &candidates[candidate];
+        chosen.flow.u[i] = candidate.flow.u[i];
+        chosen.flow.v[i] = candidate.flow.v[i];
+        chosen.visible[i] = candidate.visible[i];
+        chosen.sigma[i] = candidate.sigma[i].hypot(doubt);
     }
     chosen
+}
+
+/// The chosen candidate for pixel `i`, and how far away the truth may be because of those that disagree.
+fn choose_at(candidates: &[Judged], i: usize) -> (usize, f32) {
+    let distance = |a: &Judged, b: &Judged| (a.flow.u[i] - b.flow.u[i]).hypot(a.flow.v[i] - b.flow.v[i]);
+    let any_visible = candidates.iter().any(|candidate| candidate.visible[i]);
+    let eligible = || candidates.iter().enumerate().filter(|(_, candidate)| candidate.visible[i] == any_visible);
+    let mut best = (0, 0, f32::INFINITY);
+    for (index, candidate) in eligible() {
+        let support = eligible().filter(|(_, other)| distance(candidate, other) < AGREE).count();
+        if support > best.1 || (support == best.1 && candidate.sigma[i] < best.2) {
+            best = (index, support, candidate.sigma[i]);
+        }
+    }
+    let (index, support, _) = best;
+    if 2 * support > eligible().count() {
+        return (index, 0.0);
+    }
+    let disagreeing = eligible().map(|(_, other)| distance(&candidates[index], other)).filter(|&d| d >= AGREE);
+    let nearest = disagreeing.fold(f32::INFINITY, f32::min);
+    (index, if nearest.is_finite() { 0.5 * nearest } else { 0.0 })
 }
 
 /// The way back along visible tracks, zero where none arrives; of several the most certain counts.

@@ -89,7 +89,7 @@ fn descend_pyramid(
             settings.patch_iterations,
         );
         let dense = patches::densify(planes, &to.levels[level], &field);
-        flow = refine::refine(&from.reference(level), &to.levels[level], &dense, None, smoothing);
+        flow = refine::refine(&from.reference(level), &to.reference(level), &dense, None, smoothing);
         if level > 0 {
             let finer = &from.levels[level - 1];
             flow = flow.resampled_nearest(finer.width, finer.height, 2.0);
