@@ -72,7 +72,13 @@ struct DataTerm {
 }
 
 impl DataTerm {
-    fn new(reference: &Reference<'_>, target: &Reference<'_>, flow: &Flow, trust: Option<&[bool]>, window: usize) -> Self {
+    fn new(
+        reference: &Reference<'_>,
+        target: &Reference<'_>,
+        flow: &Flow,
+        trust: Option<&[bool]>,
+        window: usize,
+    ) -> Self {
         let (width, height) = (flow.width, flow.height);
         let residuals = residuals(reference.planes, target.planes, flow)
             .map(|channel| subtract(&channel, &box_mean(&channel, width, height, SHADING_RADIUS)));
@@ -86,16 +92,19 @@ impl DataTerm {
         for y in 0..height {
             let line = y * width..(y + 1) * width;
             let residual = [0, 1, 2].map(|channel: usize| &residuals[channel][line.clone()]);
-            let (xx, xy, yy) = (&mut term.xx[line.clone()], &mut term.xy[line.clone()], &mut term.yy[line.clone()]);
+            let (xx, xy, yy) =
+                (&mut term.xx[line.clone()], &mut term.xy[line.clone()], &mut term.yy[line.clone()]);
             let (right_x, right_y) = (&mut term.x[line.clone()], &mut term.y[line.clone()]);
             for i in 0..width {
                 let r = [residual[0][i], residual[1][i], residual[2][i]];
                 // The target's gradients: those of the reference are turned and sheared against it.
                 let [u, v] = flow.at(i, y);
-                let [gx, gy] = target.gradients.each_ref().map(|planes| planes.colour_at(i as f32 + u, y as f32 + v));
+                let [gx, gy] =
+                    target.gradients.each_ref().map(|planes| planes.colour_at(i as f32 + u, y as f32 + v));
                 let squares = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * (1.0 / 3.0);
                 let trusted = trust.is_none_or(|trust| trust[line.start + i]);
-                let weight = if trusted { 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt() } else { 0.0 };
+                let weight =
+                    if trusted { 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt() } else { 0.0 };
                 xx[i] = weight * (gx[0] * gx[0] + gx[1] * gx[1] + gx[2] * gx[2]);
                 xy[i] = weight * (gx[0] * gy[0] + gx[1] * gy[1] + gx[2] * gy[2]);
                 yy[i] = weight * (gy[0] * gy[0] + gy[1] * gy[1] + gy[2] * gy[2]);
@@ -229,8 +238,10 @@ impl Equations {
         let (next_u, next_v) = (&mut next_u[slice(centre)], &mut next_v[slice(centre)]);
         for i in 0..width {
             let total = left[i] + up[i] + right[i] + down[i] + HOLD;
-            let pull_u = left[i] * u[0][i] + up[i] * u[1][i] + right[i] * u[2][i] + down[i] * u[3][i] + right_u[i];
-            let pull_v = left[i] * v[0][i] + up[i] * v[1][i] + right[i] * v[2][i] + down[i] * v[3][i] + right_v[i];
+            let pull_u =
+                left[i] * u[0][i] + up[i] * u[1][i] + right[i] * u[2][i] + down[i] * u[3][i] + right_u[i];
+            let pull_v =
+                left[i] * v[0][i] + up[i] * v[1][i] + right[i] * v[2][i] + down[i] * v[3][i] + right_v[i];
             let (a, b, c) = (xx[i] + total, xy[i], yy[i] + total);
             let inverse = 1.0 / (a * c - b * b);
             next_u[i] = (c * pull_u - b * pull_v) * inverse;

@@ -55,7 +55,13 @@ fn unknown((width, height): (u32, u32)) -> TrackField {
     let pixels = width as usize * height as usize;
     let centres = (0..height).flat_map(|y| (0..width).map(move |x| [x as f32 + 0.5, y as f32 + 0.5]));
     let sigma = unknown_sigma(width, height);
-    TrackField { width, height, positions: centres.collect(), visible: vec![false; pixels], sigma: vec![sigma; pixels] }
+    TrackField {
+        width,
+        height,
+        positions: centres.collect(),
+        visible: vec![false; pixels],
+        sigma: vec![sigma; pixels],
+    }
 }
 
 /// Standard deviation of a position that may be anywhere in the image.
@@ -76,7 +82,14 @@ impl<'a> Tracker<'a> {
     fn new(key: &Image, settings: &'a TrackingSettings) -> Self {
         let frame = Frame::new(key, settings);
         let key_texture = consistency::texture(&frame);
-        Self { settings, width: key.width, height: key.height, key: frame, key_texture, past: VecDeque::new() }
+        Self {
+            settings,
+            width: key.width,
+            height: key.height,
+            key: frame,
+            key_texture,
+            past: VecDeque::new(),
+        }
     }
 
     fn track(&mut self, index: usize, image: &Image) -> TrackField {
@@ -100,9 +113,10 @@ impl<'a> Tracker<'a> {
 
     /// The tracks of earlier frames, continued to this one.
     fn chains(&self, index: usize, frame: &Frame) -> Vec<Judged> {
-        let earlier = self.settings.gaps.iter().filter_map(|&gap| {
-            self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
-        });
+        let earlier =
+            self.settings.gaps.iter().filter_map(|&gap| {
+                self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
+            });
         let continue_from = |past: &Past| {
             let (flow, back) = match_frames(&past.frame, frame, None, self.settings);
             let onward = consistency::judge(&past.frame, frame, flow, &back, &past.texture, self.settings);
@@ -127,7 +141,13 @@ impl<'a> Tracker<'a> {
     /// The tracks, refined once more against the key frame itself.
     fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
         let smoothing = Smoothing::of(self.settings);
-        let flow = refine(&self.key.reference(0), &frame.reference(0), &tracks.flow, Some(&tracks.visible), smoothing);
+        let flow = refine(
+            &self.key.reference(0),
+            &frame.reference(0),
+            &tracks.flow,
+            Some(&tracks.visible),
+            smoothing,
+        );
         let mut anchored = Judged { flow, ..tracks };
         consistency::widen_at_boundaries(&mut anchored);
         anchored
@@ -139,7 +159,9 @@ impl<'a> Tracker<'a> {
         let flow = &tracks.flow;
         // Every halving rounds up, so the scale is the power of two, not the ratio of the sizes.
         let mut scale = 1.0;
-        while (width as f32 / scale).ceil() as usize > flow.width || (height as f32 / scale).ceil() as usize > flow.height {
+        while (width as f32 / scale).ceil() as usize > flow.width
+            || (height as f32 / scale).ceil() as usize > flow.height
+        {
             scale *= 2.0;
         }
         let mut field = TrackField {
