@@ -126,7 +126,9 @@ fn main() -> Result<(), Anything> {
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
-            "--quality" => quality = serde_json::from_value(arguments.next().ok_or("--quality WHICH")?.into())?,
+            "--quality" => {
+                quality = serde_json::from_value(arguments.next().ok_or("--quality WHICH")?.into())?
+            }
             "--maps" => maps = Some(PathBuf::from(arguments.next().ok_or("--maps FOLDER")?)),
             "--set" => {
                 let pair = arguments.next().ok_or("--set KEY=VALUE")?;
@@ -174,7 +176,9 @@ fn main() -> Result<(), Anything> {
                 }
                 let (column, row) = (i % field.width as usize, i / field.width as usize);
                 let flow = |axis: usize| {
-                    exact.as_ref().map_or(0.0, |exact| f32::from(exact.flow[2 * (t * pixels + i) + axis]) / 64.0)
+                    exact
+                        .as_ref()
+                        .map_or(0.0, |exact| f32::from(exact.flow[2 * (t * pixels + i) + axis]) / 64.0)
                 };
                 let truth = [column as f32 + 0.5 + flow(0), row as f32 + 0.5 + flow(1)];
                 let bytes = pixels.div_ceil(8);

@@ -32,26 +32,46 @@ pub(super) fn chain(to_earlier: &Judged, onward: &Judged) -> Judged {
     Judged { flow, visible, sigma }
 }
 
-/// Per pixel the candidate with the smallest standard deviation among the visible ones, the first of equals; where
-/// none is visible, the one with the smallest of all.
+/// Candidates closer than this support each other, pixels.
+const AGREE: f32 = 2.0;
+
+/// Per pixel the visible candidate that most others agree with, of those the one with the smallest standard
+/// deviation, of equals the first. Without a majority the doubt is added to its standard deviation: repetitive or
+/// plain texture matches well in wrong places too. Where no candidate is visible, the most certain one.
 pub(super) fn choose(candidates: &[Judged]) -> Judged {
     let mut chosen = candidates[0].clone();
-    for candidate in &candidates[1..] {
-        for i in 0..chosen.sigma.len() {
-            let better = match (candidate.visible[i], chosen.visible[i]) {
-                (true, false) => true,
-                (false, true) => false,
-                _ => candidate.sigma[i] < chosen.sigma[i],
-            };
-            if better {
-                chosen.flow.u[i] = candidate.flow.u[i];
-                chosen.flow.v[i] = candidate.flow.v[i];
-                chosen.visible[i] = candidate.visible[i];
-                chosen.sigma[i] = candidate.sigma[i];
-            }
-        }
+    for i in 0..chosen.sigma.len() {
+        let (candidate, doubt) = choose_at(candidates, i);
+        let candidate = &candidates[candidate];
+        chosen.flow.u[i] = candidate.flow.u[i];
+        chosen.flow.v[i] = candidate.flow.v[i];
+        chosen.visible[i] = candidate.visible[i];
+        chosen.sigma[i] = candidate.sigma[i].hypot(doubt);
     }
     chosen
+}
+
+/// The chosen candidate for pixel `i`, and how far away the truth may be because of those that disagree.
+fn choose_at(candidates: &[Judged], i: usize) -> (usize, f32) {
+    let distance = |a: &Judged, b: &Judged| (a.flow.u[i] - b.flow.u[i]).hypot(a.flow.v[i] - b.flow.v[i]);
+    let any_visible = candidates.iter().any(|candidate| candidate.visible[i]);
+    let eligible =
+        || candidates.iter().enumerate().filter(|(_, candidate)| candidate.visible[i] == any_visible);
+    let mut best = (0, 0, f32::INFINITY);
+    for (index, candidate) in eligible() {
+        let support = eligible().filter(|(_, other)| distance(candidate, other) < AGREE).count();
+        if support > best.1 || (support == best.1 && candidate.sigma[i] < best.2) {
+            best = (index, support, candidate.sigma[i]);
+        }
+    }
+    let (index, support, _) = best;
+    if 2 * support > eligible().count() {
+        return (index, 0.0);
+    }
+    let disagreeing =
+        eligible().map(|(_, other)| distance(&candidates[index], other)).filter(|&d| d >= AGREE);
+    let nearest = disagreeing.fold(f32::INFINITY, f32::min);
+    (index, if nearest.is_finite() { 0.5 * nearest } else { 0.0 })
 }
 
 /// The way back along visible tracks, zero where none arrives; of several the most certain counts.
@@ -77,4 +97,53 @@ pub(super) fn inverted(judged: &Judged) -> Flow {
         }
     }
     back
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn constant(u: f32, v: f32, visible: bool, sigma: f32) -> Judged {
+        let (width, height) = (8, 6);
+        let mut flow = Flow::zeros(width, height);
+        flow.u.fill(u);
+        flow.v.fill(v);
+        Judged { flow, visible: vec![visible; width * height], sigma: vec![sigma; width * height] }
+    }
+
+    #[test]
+    fn chaining_adds_displacements_and_variances() {
+        let chained = chain(&constant(1.5, -1.0, true, 3.0), &constant(0.25, 2.0, true, 4.0));
+        assert!(chained.flow.u.iter().all(|&u| u == 1.75) && chained.flow.v.iter().all(|&v| v == 1.0));
+        assert!(chained.sigma.iter().all(|&sigma| sigma == 5.0));
+        // Column 7 ends at 8.75, outside.
+        assert!(chained.visible[0] && !chained.visible[7]);
+        assert!(!chain(&constant(0.0, 0.0, false, 1.0), &constant(0.0, 0.0, true, 1.0)).visible[0]);
+        assert!(!chain(&constant(0.0, 0.0, true, 1.0), &constant(0.0, 0.0, false, 1.0)).visible[0]);
+    }
+
+    #[test]
+    fn the_majority_wins_then_certainty_and_disagreement_is_doubt() {
+        let pick = |candidates: &[Judged]| {
+            let chosen = choose(candidates);
+            (chosen.flow.u[0], chosen.visible[0], chosen.sigma[0])
+        };
+        let near = constant(1.0, 0.0, true, 2.0);
+        let also_near = constant(1.5, 0.0, true, 1.0);
+        let far = constant(31.0, 0.0, true, 0.1);
+        let hidden = constant(5.0, 0.0, false, 0.01);
+        assert_eq!(pick(&[far.clone(), near.clone(), also_near.clone()]), (1.5, true, 1.0));
+        assert_eq!(pick(&[hidden.clone(), near.clone()]), (1.0, true, 2.0));
+        assert_eq!(pick(&[hidden.clone(), hidden]), (5.0, false, 0.01));
+        assert_eq!(pick(&[near, far]), (31.0, true, 0.1f32.hypot(15.0)));
+    }
+
+    #[test]
+    fn the_way_back_is_the_negative_where_something_arrives() {
+        let back = inverted(&constant(2.0, 1.0, true, 1.0));
+        assert_eq!((back.at(2, 1), back.at(7, 5)), ([-2.0, -1.0], [-2.0, -1.0]));
+        assert_eq!((back.at(1, 1), back.at(2, 0)), ([0.0, 0.0], [0.0, 0.0]));
+        assert_eq!(inverted(&constant(2.0, 1.0, false, 1.0)), Flow::zeros(8, 6));
+        assert_eq!(inverted(&constant(f32::MAX, f32::NAN, true, 1.0)), Flow::zeros(8, 6));
+    }
 }

@@ -164,3 +164,38 @@ impl Scratch {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt as _, SeedableRng as _};
+
+    use super::*;
+
+    #[test]
+    fn shifts_up_to_the_radius_are_found_both_ways() {
+        let (width, height) = (40, 30);
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let wide: Vec<[f32; 3]> =
+            (0..100 * 100).map(|_| random.random::<[f32; 3]>().map(|v| 255.0 * v)).collect();
+        let crop = |x0: usize, y0: usize| {
+            let channel = |c: usize| {
+                let at = |i: usize| wide[(y0 + i / width) * 100 + x0 + i % width][c];
+                (0..width * height).map(at).collect()
+            };
+            Planes::from_interiors(width, height, [channel(0), channel(1), channel(2)])
+        };
+        let matches = search(&crop(30, 30), &crop(19, 36), 12);
+        let (mut right, mut all) = (0, 0);
+        for y in 10..height - 10 {
+            for x in 3..width - 15 {
+                all += 2;
+                right += usize::from(matches.forward.at(x, y) == [11.0, -6.0]);
+                right += usize::from(matches.backward.at(x + 11, y - 6) == [-11.0, 6.0]);
+            }
+        }
+        assert_eq!(right, all);
+        let limited = search(&crop(30, 30), &crop(19, 36), 5);
+        assert!(limited.forward.u.iter().chain(&limited.backward.v).all(|&value| value.abs() <= 5.0));
+        assert_eq!(search(&crop(0, 0), &crop(0, 0), 12).forward, Flow::zeros(width, height));
+    }
+}

@@ -50,7 +50,9 @@ pub(super) fn agreement(first: &Frame, second: &Frame, flow: &Flow) -> Agreement
     };
     let sum = |values: &[f32]| box_sum(values, width, height, WINDOW);
     let products = |a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]| -> Vec<f32> {
-        sum(&(0..width * height).map(|i| a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i]).collect::<Vec<_>>())
+        sum(&(0..width * height)
+            .map(|i| a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i])
+            .collect::<Vec<_>>())
     };
     let (aa, ab, bb) = (products(&here, &here), products(&here, &there), products(&there, &there));
     let means = |planes: &[Vec<f32>; 3]| -> [Vec<f32>; 3] {
@@ -130,9 +132,11 @@ pub(super) fn judge(
             let i = y * flow.width + x;
             let [u, v] = flow.at(x, y);
             let inside = is_inside(x as f32 + u, y as f32 + v, flow.width, flow.height);
-            visible.push(inside && error[i] < settings.consistency && agreement.holds(i, settings.correlation));
+            visible
+                .push(inside && error[i] < settings.consistency && agreement.holds(i, settings.correlation));
             let noise = agreement.residual[i].max(4.0);
-            let variance = settings.sigma_floor.powi(2) + 0.5 * error[i] * error[i] + noise / (texture[i] + 1e-3);
+            let variance =
+                settings.sigma_floor.powi(2) + 0.5 * error[i] * error[i] + noise / (texture[i] + 1e-3);
             sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
         }
     }

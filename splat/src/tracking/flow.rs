@@ -41,20 +41,7 @@ impl Flow {
     }
 
     /// The same field on a grid of another size, displacements scaled along; `scale` is new over old resolution.
-    pub(super) fn resampled(&self, width: usize, height: usize, scale: f32) -> Self {
-        let mut out = Self::zeros(width, height);
-        for y in 0..height {
-            for x in 0..width {
-                // Pixel centres lie at index + 0.5 on either grid.
-                let at = self.sample((x as f32 + 0.5) / scale - 0.5, (y as f32 + 0.5) / scale - 0.5);
-                out.u[y * width + x] = at[0] * scale;
-                out.v[y * width + x] = at[1] * scale;
-            }
-        }
-        out
-    }
-
-    /// The nearest value for each pixel of another grid: keeps motion boundaries sharp.
+    /// The nearest value, so that motion boundaries stay sharp.
     pub(super) fn resampled_nearest(&self, width: usize, height: usize, scale: f32) -> Self {
         let mut out = Self::zeros(width, height);
         for y in 0..height {

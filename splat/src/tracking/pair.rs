@@ -54,7 +54,8 @@ pub(super) fn match_frames(
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
     let coarsest = first.levels.len() - 1;
-    let radius = (settings.search_radius.clamp(0.0, 1.0) * first.levels[coarsest].width as f32).round() as usize;
+    let radius =
+        (settings.search_radius.clamp(0.0, 1.0) * first.levels[coarsest].width as f32).round() as usize;
     let seeds = coarse::search(&first.levels[coarsest], &second.levels[coarsest], radius);
     rayon::join(
         || descend_pyramid(first, second, &seeds.forward, guides.map(|guides| guides.forward), settings),
@@ -89,7 +90,7 @@ fn descend_pyramid(
             settings.patch_iterations,
         );
         let dense = patches::densify(planes, &to.levels[level], &field);
-        flow = refine::refine(&from.reference(level), &to.levels[level], &dense, None, smoothing);
+        flow = refine::refine(&from.reference(level), &to.reference(level), &dense, None, smoothing);
         if level > 0 {
             let finer = &from.levels[level - 1];
             flow = flow.resampled_nearest(finer.width, finer.height, 2.0);

@@ -129,8 +129,9 @@ impl Search<'_> {
         let mut tried: [[f32; 2]; 12] = [[f32::INFINITY; 2]; 12];
         let mut best = ([0.0; 2], f32::INFINITY);
         for (n, &candidate) in candidates.iter().enumerate() {
-            let known =
-                |seen: &[f32; 2]| (seen[0] - candidate[0]).abs() + (seen[1] - candidate[1]).abs() < SAME_CANDIDATE;
+            let known = |seen: &[f32; 2]| {
+                (seen[0] - candidate[0]).abs() + (seen[1] - candidate[1]).abs() < SAME_CANDIDATE
+            };
             if tried.iter().any(known) {
                 continue;
             }
@@ -194,7 +195,9 @@ pub(super) fn search(
             let centre = ((x + PATCH / 2).min(width - 1), (y + PATCH / 2).min(height - 1));
             candidates.extend(guesses.iter().map(|guess| guess.at(centre.0, centre.1)));
             let neighbours = [(i > 0, 1), (j > 0, columns), (i > 0 && j > 0, columns + 1)];
-            candidates.extend(neighbours.iter().filter(|(exists, _)| *exists).map(|&(_, back)| displacement[at - back]));
+            candidates.extend(
+                neighbours.iter().filter(|(exists, _)| *exists).map(|&(_, back)| displacement[at - back]),
+            );
             let template = Template::new(reference, x, y);
             (displacement[at], cost[at]) = pass.improve(&template, x as f32, y as f32, &candidates);
         }
@@ -206,7 +209,9 @@ pub(super) fn search(
             candidates.push(displacement[at]);
             let (right, below) = (i + 1 < columns, j + 1 < rows);
             let neighbours = [(right, 1), (below, columns), (right && below, columns + 1)];
-            candidates.extend(neighbours.iter().filter(|(exists, _)| *exists).map(|&(_, ahead)| displacement[at + ahead]));
+            candidates.extend(
+                neighbours.iter().filter(|(exists, _)| *exists).map(|&(_, ahead)| displacement[at + ahead]),
+            );
             let template = Template::new(reference, xs[i], ys[j]);
             (displacement[at], cost[at]) = pass.improve(&template, xs[i] as f32, ys[j] as f32, &candidates);
         }
@@ -255,7 +260,12 @@ pub(super) fn densify(reference: &Planes, target: &Planes, field: &PatchField) -
 }
 
 /// Calls `visit(pixel, patch, index in patch)` for each pixel of the image that a patch covers.
-fn for_each_pixel(field: &PatchField, width: usize, height: usize, mut visit: impl FnMut(usize, usize, usize)) {
+fn for_each_pixel(
+    field: &PatchField,
+    width: usize,
+    height: usize,
+    mut visit: impl FnMut(usize, usize, usize),
+) {
     for (j, &y) in field.ys.iter().enumerate() {
         for (i, &x) in field.xs.iter().enumerate() {
             for row in 0..PATCH.min(height - y) {

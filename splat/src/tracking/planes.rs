@@ -27,7 +27,9 @@ impl Planes {
         let (width, height) = (image.width as usize, image.height as usize);
         let interior = |channel: usize| -> Vec<f32> {
             let values = image.pixels.iter().skip(channel).step_by(3);
-            values.map(|&value| if value.is_finite() { 255.0 * value.clamp(-4.0, 4.0) } else { 0.0 }).collect()
+            values
+                .map(|&value| if value.is_finite() { 255.0 * value.clamp(-4.0, 4.0) } else { 0.0 })
+                .collect()
         };
         Self::from_interiors(width, height, [interior(0), interior(1), interior(2)])
     }
@@ -213,4 +215,80 @@ pub(super) fn box_counts(width: usize, height: usize, radius: usize) -> Vec<f32>
 pub(super) fn box_mean(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
     let sums = box_sum(values, width, height, radius);
     sums.iter().zip(&box_counts(width, height, radius)).map(|(sum, count)| sum / count).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ramped(width: usize, height: usize) -> Planes {
+        let channel = |c: usize| (0..width * height).map(|i| ((i * 37 + c * 11) % 101) as f32).collect();
+        Planes::from_interiors(width, height, [channel(0), channel(1), channel(2)])
+    }
+
+    /// Bilinear in f64, clamped to the image, as the reference.
+    fn bilinear(planes: &Planes, channel: usize, x: f64, y: f64) -> f64 {
+        let value = |x: f64, y: f64| {
+            let column = x.clamp(0.0, planes.width as f64 - 1.0) as usize;
+            f64::from(planes.row(channel, y.clamp(0.0, planes.height as f64 - 1.0) as usize)[column])
+        };
+        let (x0, y0) = (x.floor(), y.floor());
+        let (fx, fy) = (x - x0, y - y0);
+        (1.0 - fy) * ((1.0 - fx) * value(x0, y0) + fx * value(x0 + 1.0, y0))
+            + fy * ((1.0 - fx) * value(x0, y0 + 1.0) + fx * value(x0 + 1.0, y0 + 1.0))
+    }
+
+    #[test]
+    fn sampling_agrees_with_double_precision_and_clamps_outside() {
+        let planes = ramped(13, 9);
+        for (x, y) in [(0.0f32, 0.0f32), (3.25, 4.75), (-4.5, 2.5), (11.9, 8.0), (-9.0, -9.0), (13.0, 9.0)] {
+            let patch = planes.patch_at(x, y);
+            for (i, &value) in patch.iter().enumerate() {
+                let (channel, row, column) = (i / 64, i / 8 % 8, i % 8);
+                let exact =
+                    bilinear(&planes, channel, f64::from(x) + column as f64, f64::from(y) + row as f64);
+                // Values up to 100 in f32: four roundings of 6e-8 relative, the weights another few.
+                assert!((f64::from(value) - exact).abs() < 1e-3, "{x} {y} {i}: {value} {exact}");
+            }
+            let colour = planes.colour_at(x.clamp(-1.0, 13.0), y.clamp(-1.0, 9.0));
+            let exact = bilinear(&planes, 2, f64::from(x.clamp(-1.0, 13.0)), f64::from(y.clamp(-1.0, 9.0)));
+            assert!((f64::from(colour[2]) - exact).abs() < 1e-3);
+        }
+        for far in [f32::MAX, f32::MIN, f32::INFINITY, f32::NEG_INFINITY, 1e-40] {
+            assert!(
+                planes.patch_at(far, far).iter().chain(&planes.colour_at(far, far)).all(|v| v.is_finite())
+            );
+        }
+    }
+
+    #[test]
+    fn box_means_agree_with_direct_sums() {
+        let (width, height) = (7, 5);
+        let values: Vec<f32> = (0..width * height).map(|i| ((i * 13) % 17) as f32 - 8.0).collect();
+        for radius in [0, 1, 2, 6, 100] {
+            let means = box_mean(&values, width, height, radius);
+            for (i, &mean) in means.iter().enumerate() {
+                let inside = |j: &usize| {
+                    (j % width).abs_diff(i % width) <= radius && (j / width).abs_diff(i / width) <= radius
+                };
+                let members: Vec<f64> =
+                    (0..values.len()).filter(inside).map(|j| f64::from(values[j])).collect();
+                let exact = members.iter().sum::<f64>() / members.len() as f64;
+                assert!((f64::from(mean) - exact).abs() < 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn halving_keeps_the_mean_and_rounds_sizes_up() {
+        let half = ramped(6, 4).halved();
+        let mean = |planes: &Planes| {
+            planes.interiors()[1].iter().sum::<f32>() / (planes.width * planes.height) as f32
+        };
+        assert!((mean(&half) - mean(&ramped(6, 4))).abs() < 1e-3);
+        let odd = ramped(5, 1).halved();
+        assert_eq!((odd.width, odd.height), (3, 1));
+        assert_eq!(odd.row(0, 0)[2], ramped(5, 1).row(0, 0)[4]);
+        assert_eq!(pyramid(ramped(40, 3), 10).len(), 3);
+    }
 }

@@ -12,8 +12,10 @@ use super::{
 const RESIDUAL_SCALE: f32 = 4.0;
 /// Flow difference between neighbours at which the smoothness turns from quadratic to linear, pixels.
 const DIFFERENCE_SCALE: f32 = 0.3;
+/// Weight of staying: keeps pixels without neighbour or texture where they are.
+const HOLD: f32 = 1e-4;
 /// Colour difference between neighbours that halves their smoothness, 0 to 255 scale.
-const EDGE_SCALE: f32 = 12.0;
+const EDGE_SCALE: f32 = 40.0;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
 const SHADING_RADIUS: usize = 4;
 
@@ -44,7 +46,7 @@ impl Smoothing {
 /// Refines `flow` from `reference` to `target`; where `trust` is given and false, colour does not count.
 pub(super) fn refine(
     reference: &Reference<'_>,
-    target: &Planes,
+    target: &Reference<'_>,
     flow: &Flow,
     trust: Option<&[bool]>,
     smoothing: Smoothing,
@@ -52,18 +54,12 @@ pub(super) fn refine(
     if smoothing.iterations == 0 {
         return flow.clone();
     }
-    let mut current = flow.clone();
-    let mut next = flow.clone();
+    let mut start = flow.clone();
     for _ in 0..smoothing.warps {
-        let start = current.clone();
-        let data = DataTerm::new(reference, target, &start, trust, smoothing.window as usize);
-        let links = Links::new(reference.planes, &start, smoothing.weight);
-        for _ in 0..smoothing.iterations {
-            sweep(&start, &data, &links, &current, &mut next);
-            std::mem::swap(&mut current, &mut next);
-        }
+        let equations = Equations::new(reference, target, &start, trust, smoothing);
+        start = equations.relaxed(&start, smoothing.iterations);
     }
-    current
+    start
 }
 
 /// `xx du + xy dv + x = 0`, `xy du + yy dv + y = 0` per pixel: the normal equations of the linearised residuals.
@@ -76,9 +72,15 @@ struct DataTerm {
 }
 
 impl DataTerm {
-    fn new(reference: &Reference<'_>, target: &Planes, flow: &Flow, trust: Option<&[bool]>, window: usize) -> Self {
+    fn new(
+        reference: &Reference<'_>,
+        target: &Reference<'_>,
+        flow: &Flow,
+        trust: Option<&[bool]>,
+        window: usize,
+    ) -> Self {
         let (width, height) = (flow.width, flow.height);
-        let residuals = residuals(reference.planes, target, flow)
+        let residuals = residuals(reference.planes, target.planes, flow)
             .map(|channel| subtract(&channel, &box_mean(&channel, width, height, SHADING_RADIUS)));
         let mut term = Self {
             xx: vec![0.0; width * height],
@@ -89,18 +91,20 @@ impl DataTerm {
         };
         for y in 0..height {
             let line = y * width..(y + 1) * width;
-            let gradient_x = [0, 1, 2].map(|channel: usize| reference.gradients[0].row(channel, y));
-            let gradient_y = [0, 1, 2].map(|channel: usize| reference.gradients[1].row(channel, y));
             let residual = [0, 1, 2].map(|channel: usize| &residuals[channel][line.clone()]);
-            let (xx, xy, yy) = (&mut term.xx[line.clone()], &mut term.xy[line.clone()], &mut term.yy[line.clone()]);
+            let (xx, xy, yy) =
+                (&mut term.xx[line.clone()], &mut term.xy[line.clone()], &mut term.yy[line.clone()]);
             let (right_x, right_y) = (&mut term.x[line.clone()], &mut term.y[line.clone()]);
             for i in 0..width {
                 let r = [residual[0][i], residual[1][i], residual[2][i]];
-                let gx = [gradient_x[0][i], gradient_x[1][i], gradient_x[2][i]];
-                let gy = [gradient_y[0][i], gradient_y[1][i], gradient_y[2][i]];
+                // The target's gradients: those of the reference are turned and sheared against it.
+                let [u, v] = flow.at(i, y);
+                let [gx, gy] =
+                    target.gradients.each_ref().map(|planes| planes.colour_at(i as f32 + u, y as f32 + v));
                 let squares = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * (1.0 / 3.0);
                 let trusted = trust.is_none_or(|trust| trust[line.start + i]);
-                let weight = if trusted { 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt() } else { 0.0 };
+                let weight =
+                    if trusted { 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt() } else { 0.0 };
                 xx[i] = weight * (gx[0] * gx[0] + gx[1] * gx[1] + gx[2] * gx[2]);
                 xy[i] = weight * (gx[0] * gy[0] + gx[1] * gy[1] + gx[2] * gy[2]);
                 yy[i] = weight * (gy[0] * gy[0] + gy[1] * gy[1] + gy[2] * gy[2]);
@@ -136,10 +140,11 @@ fn subtract(a: &[f32], b: &[f32]) -> Vec<f32> {
     a.iter().zip(b).map(|(a, b)| a - b).collect()
 }
 
-/// Smoothness weights of each pixel with its right and its lower neighbour; 0 across the image's edge.
+/// Smoothness weights of each pixel with its left and its upper neighbour; 0 across the image's edge. One more column
+/// and row than the image, so that the weight with the right neighbour is the next entry, the lower one a row on.
 struct Links {
-    right: Vec<f32>,
-    down: Vec<f32>,
+    left: Vec<f32>,
+    up: Vec<f32>,
 }
 
 impl Links {
@@ -150,20 +155,21 @@ impl Links {
             let edge = 1.0 + colour_difference / (EDGE_SCALE * EDGE_SCALE);
             weight / (edge * ((du * du + dv * dv) / (DIFFERENCE_SCALE * DIFFERENCE_SCALE) + 1.0).sqrt())
         };
-        let mut links = Self { right: vec![0.0; width * height], down: vec![0.0; width * height] };
+        let mut links = Self { left: vec![0.0; width * (height + 1)], up: vec![0.0; width * (height + 1)] };
         for y in 0..height {
             let rows = [0, 1, 2].map(|channel| planes.row(channel, y));
-            let below = [0, 1, 2].map(|channel| planes.row(channel, (y + 1).min(height - 1)));
+            let above = [0, 1, 2].map(|channel| planes.row(channel, y.saturating_sub(1)));
             for x in 0..width {
                 let i = y * width + x;
-                let difference = |other: [f32; 3]| -> f32 {
-                    (0..3).map(|channel| (rows[channel][x] - other[channel]).powi(2)).sum::<f32>() / 3.0
+                let difference = |other: [&[f32]; 3], at: usize| {
+                    let off = [0, 1, 2].map(|channel: usize| rows[channel][x] - other[channel][at]);
+                    (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]) / 3.0
                 };
-                if x + 1 < width {
-                    links.right[i] = link(i, i + 1, difference([0, 1, 2].map(|c: usize| rows[c][x + 1])));
+                if x > 0 {
+                    links.left[i] = link(i, i - 1, difference(rows, x - 1));
                 }
-                if y + 1 < height {
-                    links.down[i] = link(i, i + width, difference([0, 1, 2].map(|c: usize| below[c][x])));
+                if y > 0 {
+                    links.up[i] = link(i, i - width, difference(above, x));
                 }
             }
         }
@@ -171,33 +177,75 @@ impl Links {
     }
 }
 
-/// One Jacobi sweep: each pixel solves its two equations with its neighbours held.
-fn sweep(start: &Flow, data: &DataTerm, links: &Links, current: &Flow, next: &mut Flow) {
-    let (width, height) = (start.width, start.height);
-    for y in 0..height {
-        for x in 0..width {
-            let i = y * width + x;
-            let (left, up) = (if x > 0 { i - 1 } else { i }, if y > 0 { i - width } else { i });
-            let (right, down) = ((i + 1).min(width * height - 1), (i + width).min(width * height - 1));
-            let s = [
-                if x > 0 { links.right[left] } else { 0.0 },
-                if y > 0 { links.down[up] } else { 0.0 },
-                links.right[i],
-                links.down[i],
-            ];
-            let total = s[0] + s[1] + s[2] + s[3];
-            let mean = |axis: &[f32]| s[0] * axis[left] + s[1] * axis[up] + s[2] * axis[right] + s[3] * axis[down];
-            // Without a neighbour or texture the pixel stays.
-            let hold = 1e-6;
+/// Per pixel two linear equations, coupled with the four neighbours.
+struct Equations {
+    data: DataTerm,
+    links: Links,
+    /// Constant right-hand sides.
+    right: Flow,
+}
+
+impl Equations {
+    fn new(
+        reference: &Reference<'_>,
+        target: &Reference<'_>,
+        start: &Flow,
+        trust: Option<&[bool]>,
+        smoothing: Smoothing,
+    ) -> Self {
+        let data = DataTerm::new(reference, target, start, trust, smoothing.window as usize);
+        let links = Links::new(reference.planes, start, smoothing.weight);
+        let (width, height) = (start.width, start.height);
+        let mut right = Flow::zeros(width, height);
+        for i in 0..width * height {
             let (u0, v0) = (start.u[i], start.v[i]);
-            let a = data.xx[i] + total + hold;
-            let c = data.yy[i] + total + hold;
-            let b = data.xy[i];
-            let right_u = mean(&current.u) + data.xx[i] * u0 + b * v0 - data.x[i] + hold * u0;
-            let right_v = mean(&current.v) + data.yy[i] * v0 + b * u0 - data.y[i] + hold * v0;
-            let determinant = a * c - b * b;
-            next.u[i] = (c * right_u - b * right_v) / determinant;
-            next.v[i] = (a * right_v - b * right_u) / determinant;
+            right.u[i] = data.xx[i] * u0 + data.xy[i] * v0 - data.x[i] + HOLD * u0;
+            right.v[i] = data.xy[i] * u0 + data.yy[i] * v0 - data.y[i] + HOLD * v0;
+        }
+        Self { data, links, right }
+    }
+
+    /// Jacobi sweeps: each pixel solves its equations with its neighbours held.
+    fn relaxed(&self, start: &Flow, sweeps: u32) -> Flow {
+        let (width, height) = (start.width, start.height);
+        // A row before and after, so that every neighbour exists; its links are 0.
+        let padded = |axis: &[f32]| [&vec![0.0; width], axis, &vec![0.0; width]].concat();
+        let mut current = [padded(&start.u), padded(&start.v)];
+        let mut next = current.clone();
+        for _ in 0..sweeps {
+            for y in 0..height {
+                self.sweep_row(y, width, &current, &mut next);
+            }
+            std::mem::swap(&mut current, &mut next);
+        }
+        let [u, v] = current.map(|axis| axis[width..width * (height + 1)].to_vec());
+        Flow { width, height, u, v }
+    }
+
+    fn sweep_row(&self, y: usize, width: usize, current: &[Vec<f32>; 2], next: &mut [Vec<f32>; 2]) {
+        let (first, centre) = (y * width, (y + 1) * width);
+        let slice = |from: usize| from..from + width;
+        let (left, up) = (&self.links.left[slice(first)], &self.links.up[slice(first)]);
+        // The last row's last pixel has its right link at the start of the spare row.
+        let (right, down) = (&self.links.left[slice(first + 1)], &self.links.up[slice(first + width)]);
+        let data = &self.data;
+        let (xx, xy, yy) = (&data.xx[slice(first)], &data.xy[slice(first)], &data.yy[slice(first)]);
+        let (right_u, right_v) = (&self.right.u[slice(first)], &self.right.v[slice(first)]);
+        let [u, v] = current.each_ref().map(|values| {
+            [centre - 1, centre - width, centre + 1, centre + width].map(|from| &values[slice(from)])
+        });
+        let [next_u, next_v] = next;
+        let (next_u, next_v) = (&mut next_u[slice(centre)], &mut next_v[slice(centre)]);
+        for i in 0..width {
+            let total = left[i] + up[i] + right[i] + down[i] + HOLD;
+            let pull_u =
+                left[i] * u[0][i] + up[i] * u[1][i] + right[i] * u[2][i] + down[i] * u[3][i] + right_u[i];
+            let pull_v =
+                left[i] * v[0][i] + up[i] * v[1][i] + right[i] * v[2][i] + down[i] * v[3][i] + right_v[i];
+            let (a, b, c) = (xx[i] + total, xy[i], yy[i] + total);
+            let inverse = 1.0 / (a * c - b * b);
+            next_u[i] = (c * pull_u - b * pull_v) * inverse;
+            next_v[i] = (a * pull_v - b * pull_u) * inverse;
         }
     }
 }

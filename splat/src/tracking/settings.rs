@@ -19,7 +19,7 @@ pub struct TrackingSettings {
     /// Distances in frames over which tracks are chained besides the direct match with the key frame; each at least
     /// 1, default 1 and 2.
     pub gaps: Vec<u32>,
-    /// Distance of neighbouring patches, pixels; 1 to 8, default 4.
+    /// Distance of neighbouring patches, pixels; 1 to 8, default 3.
     pub patch_stride: u32,
     /// Descent steps per patch and level; 1 and up, default 12.
     pub patch_iterations: u32,
@@ -27,7 +27,7 @@ pub struct TrackingSettings {
     pub smoothness: f32,
     /// Linearisations of the variational refinement per level; 0 (off) and up, default 2.
     pub smoothing_warps: u32,
-    /// Half side of the windows that share one displacement in the refinement, pixels; 0 to 10, default 2.
+    /// Half side of the windows that share one displacement in the refinement, pixels; 0 to 10, default 3.
     pub smoothing_window: u32,
     /// Sweeps of the variational refinement per linearisation; 0 (off) and up, default 10.
     pub smoothing_iterations: u32,
@@ -55,11 +55,11 @@ impl TrackingSettings {
             search_side: 100,
             search_radius: 0.4,
             gaps: vec![1, 2],
-            patch_stride: 4,
+            patch_stride: 3,
             patch_iterations: 12,
             smoothness: 150.0,
             smoothing_warps: 2,
-            smoothing_window: 2,
+            smoothing_window: 3,
             smoothing_iterations: 10,
             consistency: 1.5,
             correlation: 0.5,
@@ -67,14 +67,19 @@ impl TrackingSettings {
             hidden_sigma: 16.0,
         };
         match quality {
-            Quality::Draft => {
-                Self { max_side: 320, search_side: 80, gaps: vec![1], patch_iterations: 8, ..balanced }
-            }
+            Quality::Draft => Self {
+                max_side: 320,
+                search_side: 80,
+                gaps: vec![1],
+                patch_stride: 4,
+                patch_iterations: 8,
+                ..balanced
+            },
             Quality::Balanced => balanced,
             Quality::Best => Self {
                 max_side: 1280,
                 gaps: vec![1, 2, 4, 8],
-                patch_stride: 3,
+                patch_stride: 2,
                 patch_iterations: 16,
                 smoothing_iterations: 20,
                 ..balanced

@@ -43,7 +43,7 @@ pub fn track_view<E>(
         let image = load(index)?;
         let field = match &mut tracker {
             Some(tracker) if (image.width, image.height) == size => tracker.track(index, &image),
-            _ => unknown(size, settings),
+            _ => unknown(size),
         };
         emit(index, field)?;
     }
@@ -51,11 +51,22 @@ pub fn track_view<E>(
 }
 
 /// All pixels hidden, where they were.
-fn unknown((width, height): (u32, u32), settings: &TrackingSettings) -> TrackField {
+fn unknown((width, height): (u32, u32)) -> TrackField {
     let pixels = width as usize * height as usize;
     let centres = (0..height).flat_map(|y| (0..width).map(move |x| [x as f32 + 0.5, y as f32 + 0.5]));
-    let sigma = width.max(height) as f32 + settings.hidden_sigma;
-    TrackField { width, height, positions: centres.collect(), visible: vec![false; pixels], sigma: vec![sigma; pixels] }
+    let sigma = unknown_sigma(width, height);
+    TrackField {
+        width,
+        height,
+        positions: centres.collect(),
+        visible: vec![false; pixels],
+        sigma: vec![sigma; pixels],
+    }
+}
+
+/// Standard deviation of a position that may be anywhere in the image.
+fn unknown_sigma(width: u32, height: u32) -> f32 {
+    width.max(height).max(1) as f32
 }
 
 struct Tracker<'a> {
@@ -71,7 +82,14 @@ impl<'a> Tracker<'a> {
     fn new(key: &Image, settings: &'a TrackingSettings) -> Self {
         let frame = Frame::new(key, settings);
         let key_texture = consistency::texture(&frame);
-        Self { settings, width: key.width, height: key.height, key: frame, key_texture, past: VecDeque::new() }
+        Self {
+            settings,
+            width: key.width,
+            height: key.height,
+            key: frame,
+            key_texture,
+            past: VecDeque::new(),
+        }
     }
 
     fn track(&mut self, index: usize, image: &Image) -> TrackField {
@@ -95,9 +113,10 @@ impl<'a> Tracker<'a> {
 
     /// The tracks of earlier frames, continued to this one.
     fn chains(&self, index: usize, frame: &Frame) -> Vec<Judged> {
-        let earlier = self.settings.gaps.iter().filter_map(|&gap| {
-            self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
-        });
+        let earlier =
+            self.settings.gaps.iter().filter_map(|&gap| {
+                self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
+            });
         let continue_from = |past: &Past| {
             let (flow, back) = match_frames(&past.frame, frame, None, self.settings);
             let onward = consistency::judge(&past.frame, frame, flow, &back, &past.texture, self.settings);
@@ -122,7 +141,13 @@ impl<'a> Tracker<'a> {
     /// The tracks, refined once more against the key frame itself.
     fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
         let smoothing = Smoothing::of(self.settings);
-        let flow = refine(&self.key.reference(0), &frame.levels[0], &tracks.flow, Some(&tracks.visible), smoothing);
+        let flow = refine(
+            &self.key.reference(0),
+            &frame.reference(0),
+            &tracks.flow,
+            Some(&tracks.visible),
+            smoothing,
+        );
         let mut anchored = Judged { flow, ..tracks };
         consistency::widen_at_boundaries(&mut anchored);
         anchored
@@ -134,7 +159,9 @@ impl<'a> Tracker<'a> {
         let flow = &tracks.flow;
         // Every halving rounds up, so the scale is the power of two, not the ratio of the sizes.
         let mut scale = 1.0;
-        while (width as f32 / scale).ceil() as usize > flow.width || (height as f32 / scale).ceil() as usize > flow.height {
+        while (width as f32 / scale).ceil() as usize > flow.width
+            || (height as f32 / scale).ceil() as usize > flow.height
+        {
             scale *= 2.0;
         }
         let mut field = TrackField {
@@ -151,9 +178,18 @@ impl<'a> Tracker<'a> {
                 let corners = flow.corners(fx, fy);
                 let visible = corners.iter().all(|&(corner, weight)| weight < 0.05 || tracks.visible[corner]);
                 let sigma: f32 = corners.iter().map(|&(corner, weight)| weight * tracks.sigma[corner]).sum();
-                field.positions.push([x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale]);
-                field.visible.push(visible);
-                field.sigma.push(sigma * scale + if visible { 0.0 } else { self.settings.hidden_sigma });
+                let position = [x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale];
+                let sigma = sigma * scale + if visible { 0.0 } else { self.settings.hidden_sigma };
+                if position[0].is_finite() && position[1].is_finite() && sigma.is_finite() && sigma > 0.0 {
+                    field.positions.push(position);
+                    field.visible.push(visible);
+                    field.sigma.push(sigma);
+                } else {
+                    // Only settings without sense lead here.
+                    field.positions.push([x as f32 + 0.5, y as f32 + 0.5]);
+                    field.visible.push(false);
+                    field.sigma.push(unknown_sigma(self.width, self.height));
+                }
             }
         }
         field
