@@ -70,10 +70,11 @@ pub struct MotionSettings {
     /// Colour difference between neighbours that halves their tie, as a distance in the sRGB cube; default
     /// 0.4, because texture differs within a body too.
     pub colour_scale: f64,
-    /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 4. Few wrong
+    /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 30. Few wrong
     /// seeds must not spread far.
     pub max_hops: usize,
-    /// Agreeing neighbours that an unobserved Gaussian needs to follow them; default 3.
+    /// Agreeing neighbours that an unobserved Gaussian needs to follow them; default 1: beside a mover
+    /// whatever is left at its old place shows.
     pub min_support: usize,
     /// Rounds of robust reweighting of the neighbours' field; default 3, `draft` 2. Zero leaves the solved
     /// motions as they are.
@@ -111,11 +112,11 @@ impl MotionSettings {
             expected_rotation: 1.0,
             rotation_significance: 3.0,
             neighbours: if is_draft { 8 } else { 12 },
-            max_edge: 4.0,
+            max_edge: 8.0,
             neighbour_strain: 0.1,
             colour_scale: 0.4,
-            max_hops: 4,
-            min_support: 3,
+            max_hops: 30,
+            min_support: 1,
             field_rounds: if is_draft { 2 } else { 3 },
             field_steps: 20,
         }
