@@ -8,7 +8,7 @@ use crate::settings::Quality;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackingSettings {
-    /// Images are halved until their longer side is at most this many pixels; 16 and up, default 640.
+    /// Images are halved until their longer side is at most this many pixels; 16 and up, default 800.
     pub max_side: u32,
     /// Images of the exhaustive search are halved until their longer side is at most this many pixels; 16 to 256,
     /// default 100. Its time grows with the fourth power.
@@ -51,7 +51,7 @@ impl TrackingSettings {
     /// The settings of a quality level.
     pub fn preset(quality: Quality) -> Self {
         let balanced = Self {
-            max_side: 640,
+            max_side: 800,
             search_side: 100,
             search_radius: 0.4,
             gaps: vec![1, 2],
@@ -68,7 +68,7 @@ impl TrackingSettings {
         };
         match quality {
             Quality::Draft => Self {
-                max_side: 320,
+                max_side: 400,
                 search_side: 80,
                 gaps: vec![1],
                 patch_stride: 4,
@@ -77,7 +77,7 @@ impl TrackingSettings {
             },
             Quality::Balanced => balanced,
             Quality::Best => Self {
-                max_side: 1280,
+                max_side: 1600,
                 gaps: vec![1, 2, 4, 8],
                 patch_stride: 2,
                 patch_iterations: 16,
