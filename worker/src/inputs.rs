@@ -46,12 +46,9 @@ pub(crate) async fn load(job: &FrameJob, blobs: &Blobs, cache: &InputCache) -> R
         training_views: loader.views(&job.training_views).await?,
         test_views: loader.views(&job.test_views).await?,
         settings,
-        is_key_frame: job.frame == KEY_FRAME,
+        is_key_frame: job.key_frame,
     })
 }
-
-/// Frame number that the static model shows.
-const KEY_FRAME: u32 = 1;
 
 fn parse_settings(json: &str) -> Result<Settings, JobError> {
     serde_json::from_str(json).map_err(|error| JobError::bad_input(format!("the job's settings: {error}")))

@@ -239,31 +239,25 @@ mod tests {
 
     #[tokio::test]
     async fn only_transient_failures_are_tried_again_and_not_for_ever() {
-        let mut calls = 0;
         let patience = Duration::from_secs(60);
-        let bad = retried(
-            async || {
-                calls += 1;
-                Err::<(), _>(JobError::bad_input("no".into()))
-            },
-            patience,
-            1,
-        );
-        assert_eq!(bad.await.unwrap_err().kind, FailureKind::BadInput);
-        assert_eq!(calls, 1);
+        let calls = std::cell::Cell::new(0);
+        let refused = || async {
+            calls.set(calls.get() + 1);
+            Err::<(), _>(JobError::bad_input("no".into()))
+        };
+        assert_eq!(retried(refused, patience, 1).await.unwrap_err().kind, FailureKind::BadInput);
+        assert_eq!(calls.get(), 1);
 
-        let mut calls = 0;
-        let passing = retried(
-            async || {
-                calls += 1;
-                if calls < 3 { Err(JobError::new(FailureKind::Transient, "later".into())) } else { Ok(calls) }
-            },
-            patience,
-            1,
-        );
-        assert_eq!(passing.await.unwrap(), 3);
+        let passing = || async {
+            calls.set(calls.get() + 1);
+            if calls.get() < 4 {
+                return Err(JobError::new(FailureKind::Transient, "later".into()));
+            }
+            Ok(calls.get())
+        };
+        assert_eq!(retried(passing, patience, 1).await.unwrap(), 4);
 
-        let gone = async || Err::<(), _>(JobError::new(FailureKind::Transient, "gone".into()));
+        let gone = || async { Err::<(), _>(JobError::new(FailureKind::Transient, "gone".into())) };
         let lasting = retried(gone, Duration::from_millis(300), 1);
         assert_eq!(lasting.await.unwrap_err().message, "gone");
     }

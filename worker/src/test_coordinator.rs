@@ -87,6 +87,7 @@ impl TestCoordinator {
         FrameJob {
             job_id: "job".into(),
             frame,
+            key_frame: frame == 1,
             settings_json: serde_json::to_string(&Settings::default()).unwrap(),
             static_model: Some(self.store(&ply::encode_ply(&two_gaussians()))),
             training_views: vec![view("cam00", 0.2), view("cam01", 0.4)],
