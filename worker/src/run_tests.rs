@@ -256,6 +256,7 @@ async fn failures_carry_their_kind() {
     session.lease("lease-1", coordinator.frame_job(2)).await;
     assert_eq!(failure(session.wait_for_report().await).0, FailureKind::OutOfResources);
     shutdown.cancel();
+    drop(session);
     worker.await.unwrap().unwrap();
 
     let (worker, shutdown) = start(&coordinator, shift());
@@ -267,6 +268,7 @@ async fn failures_carry_their_kind() {
     assert_eq!(kind, FailureKind::BadInput);
     assert!(message.contains("cam00"), "{message}");
     shutdown.cancel();
+    drop(session);
     worker.await.unwrap().unwrap();
 }
 

@@ -1,11 +1,51 @@
-//! Puts the finished frames together. Stand-in; replaced on merge.
+//! Puts the finished frames together: viewers' PLY files, deltas, `sequence.json`, `metrics.csv`, a contact sheet.
+//!
+//! ```text
+//! static.ply                the key frame
+//! frames/frame_0001.ply     every finished frame, as viewers expect
+//! deltas/frame_0001.delta   the same against static.ply, a fraction of the size
+//! sequence.json             what was run and how good it is, see [`sequence::Sequence`]
+//! metrics.csv               a row per frame and held-out view
+//! contact_sheet.png         truth, reconstruction and difference of a held-out view
+//! ```
+//! Every file is written under a temporary name and renamed, so that what has its name is complete.
 
-use std::{collections::BTreeMap, path::{Path, PathBuf}};
+mod contact_sheet;
+mod files;
+mod font;
+mod metrics_table;
+pub mod sequence;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use bytes::Bytes;
-use splat::{cameras::Camera, engine::Engine, frame::FrameReport, gaussians::Gaussians, image::Image, settings::Settings};
+use splat::{
+    cameras::Camera,
+    engine::Engine,
+    formats::ply,
+    frame::FrameReport,
+    gaussians::{Gaussians, delta},
+    image::Image,
+    settings::Settings,
+};
 
+use self::files::write_atomically;
+pub use self::files::{delta_path, frame_path};
 use crate::queue::frame::FrameState;
+
+/// The key frame's file in the output folder.
+pub const STATIC_MODEL: &str = "static.ply";
+/// The description of the sequence in the output folder.
+pub const SEQUENCE: &str = "sequence.json";
+/// The table of metrics in the output folder.
+pub const METRICS: &str = "metrics.csv";
+/// The contact sheet in the output folder.
+pub const CONTACT_SHEET: &str = "contact_sheet.png";
 
 /// Why the outputs could not be written.
 #[derive(Debug, thiserror::Error)]
@@ -18,11 +58,19 @@ pub enum AssemblyError {
         /// What the system says.
         source: std::io::Error,
     },
-    /// A delta does not fit its static model.
+    /// A delta does not fit its static model, or the frame cannot be rendered.
     #[error("frame {frame}: {reason}")]
     Frame {
         /// The frame.
         frame: u32,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A description cannot be written as JSON or CSV.
+    #[error("cannot write {file}: {reason}")]
+    Encode {
+        /// The file.
+        file: &'static str,
         /// What is wrong.
         reason: String,
     },
@@ -88,18 +136,29 @@ pub struct AssemblyInput<'a> {
     pub bytes: BTreeMap<String, u64>,
 }
 
-/// Writes everything but the frames' PLY files, which [`write_frame`] has written.
-pub fn write_outputs(_input: &AssemblyInput<'_>) -> Result<(), AssemblyError> {
-    Ok(())
+/// Writes everything but the frames' PLY files and deltas, which [`write_frame`] has written.
+///
+/// Writes `sequence.json` last: a folder that has it is complete.
+pub fn write_outputs(input: &AssemblyInput<'_>) -> Result<(), AssemblyError> {
+    write_atomically(&input.output.join(STATIC_MODEL), &input.static_ply)?;
+    write_atomically(&input.output.join(METRICS), &metrics_table::csv(&input.frames)?)?;
+    if let Some(sheet) = contact_sheet::draw(input)? {
+        write_atomically(&input.output.join(CONTACT_SHEET), &sheet.encode_png())?;
+    }
+    let sequence = sequence::Sequence::describe(input)?;
+    write_atomically(&input.output.join(SEQUENCE), &sequence.to_json()?)
 }
 
-/// Writes one frame's PLY: temporary name, then rename.
+/// Writes one frame's PLY and delta.
 pub fn write_frame(
-    _output: &Path,
-    _number: u32,
-    _static_model: &Gaussians,
-    _static_digest: &str,
-    _delta: &[u8],
+    output: &Path,
+    number: u32,
+    static_model: &Gaussians,
+    static_digest: &str,
+    delta: &[u8],
 ) -> Result<(), AssemblyError> {
-    Ok(())
+    let frame = delta::apply(static_model, static_digest, delta)
+        .map_err(|error| AssemblyError::Frame { frame: number, reason: error.to_string() })?;
+    write_atomically(&output.join(delta_path(number)), delta)?;
+    write_atomically(&output.join(frame_path(number)), &ply::write_ply(&frame))
 }

@@ -63,8 +63,7 @@ pub enum Layout {
     Llff,
 }
 
-/// What a view is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Split {
     /// The reconstruction sees its images.
