@@ -89,7 +89,7 @@ impl JobRunner {
         let mut stages = StageClock::start("fetch");
         let fetch = retried(|| inputs::load(job, blobs, &self.cache), self.patience, self.jitter_seed);
         let Some(input) = cancel.run_until_cancelled(fetch).await.transpose()? else { return Ok(None) };
-        let static_digest = job.static_model.as_ref().map(|blob| blob.digest.clone()).unwrap_or_default();
+        let static_digest = static_digest(job)?;
         let Some((delta, report)) = self.compute(input, static_digest, progress, cancel, &mut stages).await?
         else {
             return Ok(None);
@@ -106,7 +106,7 @@ impl JobRunner {
     async fn compute(
         &self,
         input: FrameInput,
-        static_digest: String,
+        static_digest: blake3::Hash,
         progress: watch::Sender<FrameProgress>,
         cancel: &CancellationToken,
         stages: &mut StageClock,
@@ -121,7 +121,7 @@ impl JobRunner {
             };
             let result = pool.install(|| {
                 let result = reconstruct(&input, &mut on_progress)?;
-                let delta = delta::encode(&input.static_model, &static_digest, &result.gaussians);
+                let delta = delta::encode(&input.static_model, static_digest.as_bytes(), &result.gaussians);
                 Ok((Bytes::from(delta), result.report))
             });
             (result, clock)
@@ -157,6 +157,12 @@ async fn retried<T, F: Future<Output = Result<T, JobError>>>(
 
 async fn store(blobs: &Blobs, delta: Bytes) -> Result<Blob, JobError> {
     Ok(blobs.put(delta).await?)
+}
+
+fn static_digest(job: &FrameJob) -> Result<blake3::Hash, JobError> {
+    let digest = job.static_model.as_ref().map_or("", |blob| blob.digest.as_str());
+    blake3::Hash::from_hex(digest)
+        .map_err(|error| JobError::bad_input(format!("the static model's digest '{digest}': {error}")))
 }
 
 /// The wire's kind of a frame's failure.

@@ -114,7 +114,8 @@ async fn a_lease_becomes_a_stored_delta_and_a_report() {
 
     let static_model = crate::test_coordinator::two_gaussians();
     let stored = coordinator.stored(&success.delta.unwrap().digest);
-    let moved = delta::apply(&static_model, &job.static_model.unwrap().digest, &stored).unwrap();
+    let static_digest = blake3::Hash::from_hex(job.static_model.unwrap().digest).unwrap();
+    let moved = delta::apply(&static_model, static_digest.as_bytes(), &stored).unwrap();
     assert_eq!(moved.len(), 2);
     assert!((moved.means[0][0] - 1.0).abs() < 1e-3, "{:?}", moved.means);
 

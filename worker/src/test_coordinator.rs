@@ -89,7 +89,7 @@ impl TestCoordinator {
             frame,
             key_frame: frame == 1,
             settings_json: serde_json::to_string(&Settings::default()).unwrap(),
-            static_model: Some(self.store(&ply::encode_ply(&two_gaussians()))),
+            static_model: Some(self.store(&ply::write_ply(&two_gaussians()))),
             training_views: vec![view("cam00", 0.2), view("cam01", 0.4)],
             test_views: vec![view("test00", 0.6)],
             ..FrameJob::default()

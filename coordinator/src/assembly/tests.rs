@@ -56,7 +56,7 @@ fn digest() -> String {
 }
 
 fn delta_of(x: f32) -> Bytes {
-    delta::encode(&gaussians(0.25), &digest(), &gaussians(x)).into()
+    delta::encode(&gaussians(0.25), &[0xab; 32], &gaussians(x)).into()
 }
 
 fn camera() -> Camera {
