@@ -58,8 +58,13 @@ pub struct BlobStore {
 }
 
 impl BlobStore {
-    /// Opens the store in a folder, which must exist.
+    /// Opens the store in a folder, which must exist. Uploads that a coordinator before left unfinished are removed.
     pub fn open(folder: &FilePath) -> Result<Self, BlobError> {
+        if let Err(error) = std::fs::remove_dir_all(folder.join("incoming"))
+            && error.kind() != std::io::ErrorKind::NotFound
+        {
+            tracing::warn!(%error, "unfinished uploads are left behind");
+        }
         // A receipt promises that the result survives, power loss included.
         let store = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
         Ok(Self { store: Arc::new(store) })
@@ -110,7 +115,8 @@ impl BlobStore {
         chunk_bytes: usize,
     ) -> Result<BoxStream<'static, Result<Bytes, BlobError>>, BlobError> {
         let pieces = self.open_blob(digest).await?.into_stream().map_err(BlobError::from);
-        let chunks = pieces.map_ok(move |piece| futures::stream::iter(split(piece, chunk_bytes))).try_flatten();
+        let chunks =
+            pieces.map_ok(move |piece| futures::stream::iter(split(piece, chunk_bytes))).try_flatten();
         let expected = digest.to_owned();
         let verified = futures::stream::unfold(
             Some((chunks.boxed(), blake3::Hasher::new(), expected)),

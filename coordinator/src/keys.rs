@@ -79,7 +79,8 @@ mod tests {
     #[test]
     fn a_frame_key_knows_its_inputs_and_not_its_job() {
         let settings = Settings::default();
-        let job = FrameJob { job_id: "a".into(), frame: 2, settings_json: "{}".into(), ..FrameJob::default() };
+        let job =
+            FrameJob { job_id: "a".into(), frame: 2, settings_json: "{}".into(), ..FrameJob::default() };
         let key = frame_key(&job, &settings, "cpu");
         let renamed = FrameJob { job_id: "b".into(), settings_json: "other text".into(), ..job.clone() };
         assert_eq!(frame_key(&renamed, &settings, "cpu"), key);

@@ -1,8 +1,9 @@
 //! The output folder of a job: who owns it, and what may be read from it.
 
 use std::{
+    ffi::OsStr,
     io::Write,
-    path::{Path, PathBuf},
+    path::{Component, Path, PathBuf},
 };
 
 use serde::{Deserialize, Serialize};
@@ -13,7 +14,7 @@ pub(crate) const MARKER: &str = "trackersplat.json";
 
 /// Why a folder cannot take a job's results.
 #[derive(Debug, Error)]
-pub enum OutputError {
+pub(crate) enum OutputError {
     /// It holds the results of another clip.
     #[error(
         "the output folder {output} belongs to the clip {owner} (digest {owner_digest}), not to {clip} (digest {digest}); \
@@ -110,11 +111,6 @@ pub(crate) fn claim(output: &Path, marker: &Marker) -> Result<(), OutputError> {
     write().map_err(unwritable)
 }
 
-/// Where [`crate::assembly::write_frame`] puts a frame.
-pub(crate) fn frame_file(output: &Path, frame: u32) -> PathBuf {
-    output.join(format!("frames/frame_{frame:04}.ply"))
-}
-
 /// The finished files under a folder, relative to it, in order; hidden and temporary ones, links and `private` left out.
 pub(crate) fn list_files(output: &Path, private: &[PathBuf]) -> std::io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
@@ -123,13 +119,14 @@ pub(crate) fn list_files(output: &Path, private: &[PathBuf]) -> std::io::Result<
         for entry in std::fs::read_dir(folder)? {
             let entry = entry?;
             let (path, kind) = (entry.path(), entry.file_type()?);
-            let is_hidden = entry.file_name().to_string_lossy().starts_with('.');
-            if is_hidden || private.contains(&path) {
+            if is_unfinished(&entry.file_name()) || private.contains(&path) {
                 continue;
             }
             if kind.is_dir() {
                 folders.push(path);
-            } else if kind.is_file() && let Ok(relative) = path.strip_prefix(output) {
+            } else if kind.is_file()
+                && let Ok(relative) = path.strip_prefix(output)
+            {
                 files.push(relative.to_owned());
             }
         }
@@ -138,9 +135,15 @@ pub(crate) fn list_files(output: &Path, private: &[PathBuf]) -> std::io::Result<
     Ok(files)
 }
 
+/// Hidden, or written under a temporary name.
+fn is_unfinished(name: &OsStr) -> bool {
+    let name = name.to_string_lossy();
+    name.starts_with('.') || name.ends_with(".partial")
+}
+
 /// The file that a relative path names, if it is one that [`list_files`] would list.
 pub(crate) fn resolve(output: &Path, relative: &str, private: &[PathBuf]) -> Option<PathBuf> {
-    let is_plain = |part| matches!(part, std::path::Component::Normal(name) if !name.to_string_lossy().starts_with('.'));
+    let is_plain = |part| matches!(part, Component::Normal(name) if !is_unfinished(name));
     let relative = Path::new(relative);
     if relative.as_os_str().is_empty() || !relative.components().all(is_plain) {
         return None;
@@ -202,7 +205,14 @@ mod tests {
         std::fs::create_dir_all(output.join("frames")).unwrap();
         std::fs::create_dir_all(output.join("blobs")).unwrap();
         let secret = root.path().join("secret");
-        for file in [secret.clone(), output.join("a.csv"), output.join("frames/1.ply"), output.join(".hidden"), output.join("blobs/b")] {
+        for file in [
+            secret.clone(),
+            output.join("a.csv"),
+            output.join("frames/1.ply"),
+            output.join(".hidden"),
+            output.join("a.csv.partial"),
+            output.join("blobs/b"),
+        ] {
             std::fs::write(file, "x").unwrap();
         }
         #[cfg(unix)]
@@ -212,7 +222,19 @@ mod tests {
         assert_eq!(listed, [PathBuf::from("a.csv"), PathBuf::from("frames/1.ply")]);
         assert!(resolve(&output, "frames/1.ply", &private).is_some());
         let absolute = secret.to_string_lossy().into_owned();
-        for outside in ["", "..", "../secret", "frames/../../secret", &absolute, "link", ".hidden", "frames", "blobs/b", "none"] {
+        for outside in [
+            "",
+            "..",
+            "../secret",
+            "frames/../../secret",
+            &absolute,
+            "link",
+            ".hidden",
+            "a.csv.partial",
+            "frames",
+            "blobs/b",
+            "none",
+        ] {
             assert_eq!(resolve(&output, outside, &private), None, "{outside}");
         }
     }

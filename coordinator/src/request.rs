@@ -1,11 +1,14 @@
 //! What a submission asks for, as it is stored.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use splat::{clip::ClipOptions, settings::Settings};
 
 use crate::keys::digest_of;
+
+/// Decoded images that a clip may keep in memory.
+const CLIP_CACHE_BYTES: u64 = 256 << 20;
 
 /// A file that the job reads.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,12 +51,13 @@ pub(crate) struct JobRequest {
 }
 
 impl JobRequest {
-    pub(crate) fn clip_options(&self, cache_bytes: u64) -> ClipOptions {
+    /// `scratch` is the folder for frames that are decoded from videos.
+    pub(crate) fn clip_options(&self, scratch: PathBuf) -> ClipOptions {
         ClipOptions {
             test_views: self.test_views.clone(),
             frames: self.frames,
-            cache_bytes,
-            ..ClipOptions::default()
+            cache_bytes: CLIP_CACHE_BYTES,
+            scratch: Some(scratch),
         }
     }
 
@@ -64,7 +68,9 @@ impl JobRequest {
         request.static_model.iter_mut().for_each(nameless);
         if let TrackSource::Files(files) = &mut request.tracks {
             let by_name = self.track_files_by_name;
-            files.iter_mut().for_each(|file| file.path = if by_name { file.stem().to_owned() } else { String::new() });
+            files
+                .iter_mut()
+                .for_each(|file| file.path = if by_name { file.stem().to_owned() } else { String::new() });
             if by_name {
                 files.sort_by(|a, b| a.path.cmp(&b.path));
             }

@@ -1,8 +1,9 @@
 //! Starting and ending a coordinator.
 
 use std::{
+    fs::{File, TryLockError},
     net::SocketAddr,
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -51,6 +52,12 @@ pub enum ServeError {
         root: PathBuf,
         /// What the system says.
         source: std::io::Error,
+    },
+    /// Another coordinator uses the folder.
+    #[error("another coordinator uses the folder {root}; stop it, or give another folder")]
+    InUse {
+        /// The folder.
+        root: PathBuf,
     },
     /// The address cannot be listened on.
     #[error("cannot listen on {address}: {source}; stop the program that uses it, or give another port")]
@@ -110,6 +117,7 @@ pub async fn serve(
     std::fs::create_dir_all(&blob_folder).map_err(root_failed)?;
     // Absolute, because workers open it from elsewhere.
     options.root = options.root.canonicalize().map_err(root_failed)?;
+    let lock = lock(&options.root)?;
     let store = Store::open(&options.root.join("state.sqlite")).await?;
     let blobs = BlobStore::open(&options.root.join("blobs"))?;
     let probe = blobs.put(Bytes::from_static(b"trackersplat blob store")).await?;
@@ -121,11 +129,22 @@ pub async fn serve(
     let hub = Arc::new(Hub::new(options, store, blobs, probe, compute, engine, shutdown));
     hub.recover().await?;
     tracing::info!(%address, root = %hub.options.root.display(), "coordinator serves");
-    let task = tokio::spawn(run(hub, listener));
+    let task = tokio::spawn(run(hub, listener, lock));
     Ok(Running { address, task })
 }
 
-async fn run(hub: Arc<Hub>, listener: TcpListener) -> Result<(), ServeError> {
+/// Two coordinators on one state would void each other's leases. The lock ends with the process at the latest.
+fn lock(root: &Path) -> Result<File, ServeError> {
+    let failed = |source| ServeError::Root { root: root.to_owned(), source };
+    let file = File::create(root.join("lock")).map_err(failed)?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(ServeError::InUse { root: root.to_owned() }),
+        Err(TryLockError::Error(source)) => Err(failed(source)),
+    }
+}
+
+async fn run(hub: Arc<Hub>, listener: TcpListener, lock: File) -> Result<(), ServeError> {
     let ticker = tokio::spawn(tick(hub.clone()));
     let shutdown = hub.shutdown.clone();
     let server = Server::builder()
@@ -150,6 +169,7 @@ async fn run(hub: Arc<Hub>, listener: TcpListener) -> Result<(), ServeError> {
     // The ticker only waits for the shutdown now; it cannot fail.
     let _ = ticker.await;
     hub.store.close().await;
+    drop(lock);
     served?;
     match hub.take_fatal() {
         Some(error) => Err(error.into()),

@@ -25,7 +25,11 @@ pub fn check_digest(digest: &str) -> Result<(), InvalidId> {
 /// Checks the name of a worker.
 pub fn check_worker_id(id: &str) -> Result<(), InvalidId> {
     let is_plain = id.bytes().all(|c| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'_' | b'.'));
-    if is_plain && (1..=MAX_WORKER_ID).contains(&id.len()) { Ok(()) } else { Err(InvalidId::Worker(excerpt(id))) }
+    if is_plain && (1..=MAX_WORKER_ID).contains(&id.len()) {
+        Ok(())
+    } else {
+        Err(InvalidId::Worker(excerpt(id)))
+    }
 }
 
 /// The beginning of a hostile name, short enough for an error message.

@@ -7,10 +7,9 @@ use trackersplat_proto::v1::{Blob, FailureKind};
 
 use super::Job;
 use crate::{
-    assembly::{self, AssembledFrame, AssembledView, AssemblyInput},
+    assembly::{self, AssembledFrame, AssembledView, AssemblyInput, delta_path, frame_path},
     failure::StageError,
     hub::{FrameBase, Hub},
-    output::frame_file,
     queue::frame::FrameState,
     store::{FrameRecord, ViewRecord},
 };
@@ -38,7 +37,8 @@ impl Job {
         let clip_digest = self.record.clip_digest.clone();
         let runtime = tokio::runtime::Handle::current();
         let write = move || {
-            let test_image = |view: &str, frame: u32| load_image(&hub, &runtime, &parts.test_images, view, frame);
+            let test_image =
+                |view: &str, frame: u32| load_image(&hub, &runtime, &parts.test_images, view, frame);
             let views = parts.views.into_iter();
             let input = AssemblyInput {
                 output: parts.base.output.clone(),
@@ -69,12 +69,11 @@ impl Job {
     async fn parts(&self, records: &[FrameRecord]) -> Result<Parts, StageError> {
         let base = self.load_base().await?;
         let views = self.views().await?;
-        let mut bytes = BTreeMap::from([("static_model".to_owned(), base.blob.size)]);
-        let mut add = |what: &str, size: u64| *bytes.entry(what.to_owned()).or_default() += size;
+        let (mut image_bytes, mut track_bytes, mut delta_bytes) = (0, 0, 0);
         let mut test_images = BTreeMap::new();
         for &frame in &self.frames {
             for record in self.hub.store.images(&self.id, frame).await? {
-                add("images", record.image.size + record.mask.map_or(0, |mask| mask.size));
+                image_bytes += record.image.size + record.mask.map_or(0, |mask| mask.size);
                 if let Some(view) = views.get(record.position).filter(|view| view.held_out) {
                     test_images.insert((view.name.clone(), frame), record.image);
                 }
@@ -83,14 +82,20 @@ impl Job {
         let tracked = self.settings.motion_source == MotionSource::Tracks;
         for (position, view) in views.iter().enumerate().filter(|(_, view)| tracked && !view.held_out) {
             let tracks = self.tracks_of(position, &view.name).await?.unwrap_or_default();
-            add("tracks", tracks.values().map(|blob| blob.size).sum());
+            track_bytes += tracks.values().map(|blob| blob.size).sum::<u64>();
         }
         let mut frames = Vec::new();
         for record in records {
             let frame = self.assembled(record, &base).await?;
-            add("deltas", frame.delta.as_ref().map_or(0, |delta| delta.len() as u64));
+            delta_bytes += frame.delta.as_ref().map_or(0, |delta| delta.len() as u64);
             frames.push(frame);
         }
+        let bytes = [
+            ("images", image_bytes),
+            ("tracks", track_bytes),
+            ("static_model", base.blob.size),
+            ("deltas", delta_bytes),
+        ];
         let job = self.hub.store.job(&self.id).await?.ok_or(StageError::Stopped)?;
         Ok(Parts {
             static_ply: self.hub.blobs.get(&base.blob).await?,
@@ -100,18 +105,23 @@ impl Job {
             frames,
             views,
             test_images,
-            bytes,
+            bytes: bytes.map(|(what, size)| (what.to_owned(), size)).into(),
         })
     }
 
     /// One frame with its delta; its file is written again if somebody removed it.
-    async fn assembled(&self, record: &FrameRecord, base: &Arc<FrameBase>) -> Result<AssembledFrame, StageError> {
+    async fn assembled(
+        &self,
+        record: &FrameRecord,
+        base: &Arc<FrameBase>,
+    ) -> Result<AssembledFrame, StageError> {
         let delta = match record.delta() {
             Some(blob) => Some(self.hub.blobs.get(&blob).await?),
             None => None,
         };
+        let exists = |file: PathBuf| base.output.join(file).exists();
         if let Some(delta) = &delta
-            && !frame_file(&base.output, record.frame).exists()
+            && !(exists(frame_path(record.frame)) && exists(delta_path(record.frame)))
         {
             self.hub.write_frame(base.clone(), record.frame, delta.clone()).await?;
         }
@@ -137,7 +147,8 @@ impl Job {
         }
         let Some(&first) = failed.first() else { return Ok(()) };
         let why = self.hub.store.last_failure(&self.id, first).await?;
-        let (kind, reason) = why.unwrap_or((FailureKind::OutOfResources, "no worker has the memory for it".into()));
+        let (kind, reason) =
+            why.unwrap_or((FailureKind::OutOfResources, "no worker has the memory for it".into()));
         let message = format!(
             "{} of {} frames failed: {failed:?}; frame {first}: {reason}; the others are in {}",
             failed.len(),
@@ -158,8 +169,10 @@ fn load_image(
 ) -> Option<Image> {
     let blob = images.get(&(view.to_owned(), frame))?;
     let bytes = runtime.block_on(hub.blobs.get(blob));
-    let image = bytes.map_err(|error| error.to_string()).and_then(|bytes| {
-        Image::decode(&bytes).map_err(|error| error.to_string())
-    });
-    image.inspect_err(|reason| tracing::warn!(view, frame, reason, "a test image is left out of the outputs")).ok()
+    let image = bytes
+        .map_err(|error| error.to_string())
+        .and_then(|bytes| Image::decode(&bytes).map_err(|error| error.to_string()));
+    image
+        .inspect_err(|reason| tracing::warn!(view, frame, reason, "a test image is left out of the outputs"))
+        .ok()
 }

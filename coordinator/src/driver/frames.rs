@@ -28,7 +28,9 @@ impl Job {
             let request = self.frame_job(frame, &base.blob, &views, &tracks).await?;
             let key = frame_key(&request, &self.settings, self.hub.engine.name());
             match self.held_artifact(&key).await? {
-                Some(known) if !self.is_done(frame).await? => self.reuse(&base, &request, &key, &known).await?,
+                Some(known) if !self.is_done(frame).await? => {
+                    self.reuse(&base, &request, &key, &known).await?
+                }
                 _ => self.hub.publish(&self.id, &request, &key).await?,
             }
             let _ = progress.advance(self.frames.len() as u64);
@@ -56,13 +58,17 @@ impl Job {
         let blob = record
             .static_model()
             .ok_or_else(|| StageError::new(FailureKind::Bug, "the job has no static model yet"))?;
+        let digest = *blake3::Hash::from_hex(&blob.digest)
+            .map_err(|error| StageError::new(FailureKind::Bug, format!("the static model's name: {error}")))?
+            .as_bytes();
         let bytes = self.hub.blobs.get(&blob).await?;
         let decode = move || {
-            ply::parse_ply(&bytes)
-                .map_err(|error| StageError::new(FailureKind::Bug, format!("the stored static model: {error}")))
+            ply::parse_ply(&bytes).map_err(|error| {
+                StageError::new(FailureKind::Bug, format!("the stored static model: {error}"))
+            })
         };
         let model = self.hub.compute.run(decode).await?;
-        Ok(Arc::new(FrameBase { model, blob, output: record.output.into() }))
+        Ok(Arc::new(FrameBase { model, blob, digest, output: record.output.into() }))
     }
 
     /// Tracks by view position and frame number; empty where the motion is not tracked.
@@ -73,7 +79,8 @@ impl Job {
         }
         for (position, view) in views.iter().enumerate().filter(|(_, view)| !view.held_out) {
             tracks[position] = self.tracks_of(position, &view.name).await?.ok_or_else(|| {
-                let message = format!("the stored tracks of view '{}' are gone; submit the job again", view.name);
+                let message =
+                    format!("the stored tracks of view '{}' are gone; submit the job again", view.name);
                 StageError::new(FailureKind::Transient, message)
             })?;
         }
@@ -97,7 +104,8 @@ impl Job {
             ..FrameJob::default()
         };
         for record in images {
-            let (Some(view), Some(view_tracks)) = (views.get(record.position), tracks.get(record.position)) else {
+            let (Some(view), Some(view_tracks)) = (views.get(record.position), tracks.get(record.position))
+            else {
                 continue;
             };
             let frame_view = FrameView {

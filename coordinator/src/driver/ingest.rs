@@ -4,10 +4,7 @@ use std::{collections::BTreeSet, sync::Arc};
 
 use bytes::Bytes;
 use rayon::prelude::*;
-use splat::{
-    clip::{Clip, Split, View},
-    image::{Image, Mask},
-};
+use splat::clip::{Clip, Split, View};
 
 use super::{Job, progress::StageProgress};
 use crate::{
@@ -34,10 +31,10 @@ impl Job {
         let progress = StageProgress::new(self, "ingest");
         let total = self.frames.len() as u64;
         let _turn = self.turn().await?;
-        for &frame in &self.frames {
+        for (index, &frame) in self.frames.iter().enumerate() {
             go_on(&self.stop)?;
             if !self.is_ingested(frame, views.len()).await? {
-                self.ingest_frame(&clip, frame).await?;
+                self.ingest_frame(&clip, index, frame).await?;
             }
             let _ = progress.advance(total);
         }
@@ -49,18 +46,23 @@ impl Job {
         if images.len() != views {
             return Ok(false);
         }
-        for blob in images.iter().flat_map(|record| std::iter::once(&record.image).chain(&record.mask)) {
-            if !self.hub.blobs.holds(blob).await {
+        for ImageRecord { image, mask, .. } in &images {
+            if !self.hub.blobs.holds(image).await {
+                return Ok(false);
+            }
+            if let Some(mask) = mask
+                && !self.hub.blobs.holds(mask).await
+            {
                 return Ok(false);
             }
         }
         Ok(true)
     }
 
-    async fn ingest_frame(&self, clip: &Arc<Clip>, frame: u32) -> Result<(), StageError> {
+    async fn ingest_frame(&self, clip: &Arc<Clip>, index: usize, frame: u32) -> Result<(), StageError> {
         let clip = clip.clone();
         let read = move || -> Result<Vec<ViewFiles>, StageError> {
-            (0..clip.views().len()).into_par_iter().map(|view| read_view(&clip, view, frame)).collect()
+            (0..clip.views().len()).into_par_iter().map(|view| read_view(&clip, view, index)).collect()
         };
         let mut records = Vec::new();
         for (position, files) in self.hub.compute.run(read).await?.into_iter().enumerate() {
@@ -100,29 +102,11 @@ fn check_views(views: &[View], clip: &str) -> Result<(), StageError> {
     }
 }
 
-/// Reads and decodes one view's files, so that a damaged one fails the job before any frame is computed.
-fn read_view(clip: &Clip, view: usize, frame: u32) -> Result<ViewFiles, StageError> {
+/// Reads one view's files. The clip decodes them and checks their sizes, so that a damaged one fails the job before any
+/// frame is computed.
+fn read_view(clip: &Clip, view: usize, index: usize) -> Result<ViewFiles, StageError> {
     let bad = |error: splat::clip::ClipError| StageError::bad_input(error.to_string());
-    let View { name, camera, .. } = &clip.views()[view];
-    let image = clip.encoded_image(view, frame).map_err(bad)?;
-    let mask = clip.encoded_mask(view, frame).map_err(bad)?;
-    let check = |what: &str, size: (u32, u32)| {
-        if size == (camera.width, camera.height) {
-            return Ok(());
-        }
-        Err(StageError::bad_input(format!(
-            "{what} of view '{name}' at frame {frame} has {} x {} pixels, its camera {} x {}; make both the same size",
-            size.0, size.1, camera.width, camera.height
-        )))
-    };
-    let undecodable = |what: &str, error: splat::image::DecodeError| {
-        StageError::bad_input(format!("{what} of view '{name}' at frame {frame}: {error}"))
-    };
-    let decoded = Image::decode(&image).map_err(|error| undecodable("the image", error))?;
-    check("the image", (decoded.width, decoded.height))?;
-    if let Some(mask) = &mask {
-        let decoded = Mask::decode(mask).map_err(|error| undecodable("the mask", error))?;
-        check("the mask", (decoded.width, decoded.height))?;
-    }
+    let image = clip.encoded_image(view, index).map_err(bad)?;
+    let mask = clip.encoded_mask(view, index).map_err(bad)?;
     Ok(ViewFiles { image: image.into(), mask: mask.map(Bytes::from) })
 }

@@ -31,9 +31,6 @@ use crate::{
     store::{JobRecord, StoreError, ViewRecord},
 };
 
-/// Decoded images that a clip may keep in memory.
-const CLIP_CACHE_BYTES: u64 = 256 << 20;
-
 /// What every stage works with.
 struct Job {
     hub: Arc<Hub>,
@@ -75,7 +72,7 @@ async fn run_stages(
         Ok(()) | Err(StageError::Stopped) => Ok(()),
         Err(StageError::State(error)) => Err(error),
         Err(StageError::Failed(failure)) => {
-            hub.end_job(id, JobTrigger::Fail, Some(&failure)).await?;
+            hub.end_job(id.clone(), JobTrigger::Fail, Some(failure)).await?;
             Ok(())
         }
     }
@@ -93,7 +90,8 @@ impl Job {
         let wrong = |place, error: serde_json::Error| {
             StageError::State(StoreError::Value { place, value: error.to_string() })
         };
-        let settings = serde_json::from_str(&record.settings).map_err(|error| wrong("jobs.settings", error))?;
+        let settings =
+            serde_json::from_str(&record.settings).map_err(|error| wrong("jobs.settings", error))?;
         let request = serde_json::from_str(&record.request).map_err(|error| wrong("jobs.request", error))?;
         let frames = record.frame_numbers()?;
         Ok(Self { hub, id, stop, frame_ended, record, settings: Arc::new(settings), request, frames, clip })
@@ -143,7 +141,8 @@ impl Job {
         if let Some(clip) = &self.clip {
             return Ok(clip.clone());
         }
-        let (path, options) = (self.record.clip.clone(), self.request.clip_options(CLIP_CACHE_BYTES));
+        let (path, options) =
+            (self.record.clip.clone(), self.request.clip_options(self.hub.scratch_folder()));
         let submitted = self.record.clip_digest.clone();
         let open = move || open_unchanged(Path::new(&path), &options, &submitted);
         let clip = Arc::new(self.hub.compute.run(open).await?);

@@ -20,6 +20,9 @@ use crate::{
     store::Artifact,
 };
 
+/// Position of the key frame among the clip's frames.
+const KEY_INDEX: usize = 0;
+
 impl Job {
     pub(super) async fn make_static_model(&mut self) -> Result<(), StageError> {
         let artifact = match self.request.static_model.clone() {
@@ -61,9 +64,9 @@ impl Job {
             return Ok(known);
         }
         let progress = StageProgress::new(self, "static-model");
-        let (engine, settings, key_frame) = (self.hub.engine.clone(), self.settings.clone(), self.key_frame());
+        let (engine, settings) = (self.hub.engine.clone(), self.settings.clone());
         let work = move || {
-            let input = input(&clip, key_frame, &settings)?;
+            let input = input(&clip, &settings)?;
             let mut last = StaticModelProgress { step: 0, steps: 0, gaussians: 0, loss: 0.0 };
             let mut on_progress = |now: StaticModelProgress| {
                 last = now;
@@ -126,15 +129,15 @@ fn encode(model: &Gaussians, source: &str) -> Result<Bytes, StageError> {
     Ok(Bytes::from(ply::write_ply(model)))
 }
 
-fn input(clip: &Clip, key_frame: u32, settings: &Settings) -> Result<StaticModelInput, StageError> {
+fn input(clip: &Clip, settings: &Settings) -> Result<StaticModelInput, StageError> {
     let bad = |error: splat::clip::ClipError| StageError::bad_input(error.to_string());
     let mut views = Vec::new();
     for (index, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
         let mask = match settings.masks {
-            MaskUse::Train => clip.mask(index, key_frame).map_err(bad)?,
+            MaskUse::Train => clip.mask(index, KEY_INDEX).map_err(bad)?,
             MaskUse::Evaluate => None,
         };
-        let image = clip.image(index, key_frame).map_err(bad)?;
+        let image = clip.image(index, KEY_INDEX).map_err(bad)?;
         views.push(TrainingView { camera: view.camera.clone(), image, mask });
     }
     Ok(StaticModelInput {

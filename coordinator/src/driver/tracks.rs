@@ -131,7 +131,8 @@ impl Job {
 
     async fn missing_views(&self, clip: &Clip) -> Result<Vec<MissingView>, StageError> {
         let mut missing = Vec::new();
-        for (position, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
+        for (position, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train)
+        {
             let file = match &self.request.tracks {
                 TrackSource::Own => None,
                 TrackSource::Exact => Some(clip.exact_flow_path(position)),
@@ -179,7 +180,7 @@ impl TrackRun {
             let fields = read.map_err(|error| bad_tracks(view, error))?;
             exact_fields(view, &self.frames, fields)?
         } else {
-            let fields = track_npz::read_tracks(file).map_err(|error| bad_tracks(view, error))?;
+            let fields = track_npz::read_track_npz(file).map_err(|error| bad_tracks(view, error))?;
             imported_fields(view, self.frames.len(), fields)?
         };
         for (index, field) in (1..).zip(fields) {
@@ -190,7 +191,7 @@ impl TrackRun {
 
     fn track(&self, view: &MissingView) -> Result<(), StageError> {
         let mut load = |index: usize| {
-            let image = self.clip.image(view.position, self.frames[index]);
+            let image = self.clip.image(view.position, index);
             image.map_err(|error| StageError::bad_input(error.to_string()))
         };
         let mut emit = |index: usize, field: TrackField| self.emit(view, index, &field);
@@ -223,13 +224,16 @@ fn exact_fields(
         let key_frame = frames.first().copied().unwrap_or_default();
         return Err(bad_tracks(
             view,
-            format!("exact tracks start at frame 1, the key frame is {key_frame}; begin with frame 1 or use own tracks"),
+            format!(
+                "exact tracks start at frame 1, the key frame is {key_frame}; begin with frame 1 or use own tracks"
+            ),
         ));
     }
     let held = fields.len();
     let last = frames.last().copied().unwrap_or_default() as usize;
     if held + 1 < last {
-        let reason = format!("it reaches frame {}, the job needs frame {last}; reconstruct fewer frames", held + 1);
+        let reason =
+            format!("it reaches frame {}, the job needs frame {last}; reconstruct fewer frames", held + 1);
         return Err(bad_tracks(view, reason));
     }
     let wanted: Vec<usize> = frames[1..].iter().map(|&frame| frame as usize - 2).collect();
@@ -242,21 +246,21 @@ fn exact_fields(
     Ok(fields)
 }
 
-/// Imported tracks hold one field per frame, with or without the key frame itself.
+/// Imported tracks hold a field for every frame after the key frame, or for more.
 fn imported_fields(
     view: &MissingView,
     frames: usize,
     mut fields: Vec<TrackField>,
 ) -> Result<Vec<TrackField>, StageError> {
-    if fields.len() == frames {
-        fields.remove(0);
-    } else if fields.len() + 1 != frames {
+    let wanted = frames - 1;
+    if fields.len() < wanted {
         let reason = format!(
-            "it holds {} frames, the job has {frames}; give tracks for every frame, with or without the key frame",
+            "it reaches {} frames beyond the key frame, the job needs {wanted}; reconstruct fewer frames",
             fields.len()
         );
         return Err(bad_tracks(view, reason));
     }
+    fields.truncate(wanted);
     check_size(view, &fields)?;
     Ok(fields)
 }
@@ -285,7 +289,13 @@ mod tests {
     }
 
     fn field(x: f32) -> TrackField {
-        TrackField { width: 2, height: 1, positions: vec![[x, 0.0]; 2], visible: vec![true; 2], sigma: vec![0.1; 2] }
+        TrackField {
+            width: 2,
+            height: 1,
+            positions: vec![[x, 0.0]; 2],
+            visible: vec![true; 2],
+            sigma: vec![0.1; 2],
+        }
     }
 
     fn refusal(result: Result<Vec<TrackField>, StageError>) -> String {
@@ -305,12 +315,12 @@ mod tests {
     }
 
     #[test]
-    fn imported_tracks_may_hold_the_key_frame_or_not() {
-        let with_key = imported_fields(&view(), 3, vec![field(1.0), field(2.0), field(3.0)]).unwrap();
-        let without = imported_fields(&view(), 3, vec![field(2.0), field(3.0)]).unwrap();
-        assert_eq!(with_key, without);
-        let message = refusal(imported_fields(&view(), 3, vec![field(2.0)]));
-        assert!(message.contains("1 frames") && message.contains("has 3"), "{message}");
+    fn imported_tracks_may_reach_beyond_the_job_and_must_reach_its_end() {
+        let fields = || vec![field(2.0), field(3.0), field(4.0)];
+        assert_eq!(imported_fields(&view(), 3, fields()).unwrap(), [field(2.0), field(3.0)]);
+        assert_eq!(imported_fields(&view(), 4, fields()).unwrap(), fields());
+        let message = refusal(imported_fields(&view(), 5, fields()));
+        assert!(message.contains("reaches 3") && message.contains("needs 4"), "{message}");
     }
 
     #[test]

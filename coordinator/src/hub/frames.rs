@@ -66,7 +66,8 @@ impl Hub {
             None => change.append_ready_event(job, frame).await?,
         }
         change.commit_frame(job, frame, result).await?;
-        let event = FrameEvent { frame, worker: result.worker, report: result.report, ..FrameEvent::default() };
+        let event =
+            FrameEvent { frame, worker: result.worker, report: result.report, ..FrameEvent::default() };
         change.append_frame_event(job, FrameState::Done, &event).await?;
         change.commit().await?;
         desk.queue.close_ready(&FrameKey { job: job.clone(), frame });

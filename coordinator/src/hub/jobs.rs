@@ -39,7 +39,11 @@ impl Hub {
     }
 
     /// A new job begins.
-    pub(crate) async fn create_job(self: &Arc<Self>, job: &NewJob, clip: Arc<Clip>) -> Result<(), StoreError> {
+    pub(crate) async fn create_job(
+        self: &Arc<Self>,
+        job: &NewJob,
+        clip: Arc<Clip>,
+    ) -> Result<(), StoreError> {
         let mut change = self.store.change().await?;
         change.insert_job(job).await?;
         change.append_job_event(&job.id, JobState::Ingesting, None).await?;
@@ -78,7 +82,7 @@ impl Hub {
         self.desk.lock().await.active.insert(id.clone(), active);
         self.tell_stored(&id);
         let hub = self.clone();
-        self.spawn_driver(async move { driver::run(hub, id, stop, frame_ended, clip).await });
+        self.spawn_driver(driver::run(hub, id, stop, frame_ended, clip));
     }
 
     /// The job's stage ended well. `Stopped` if somebody ended the job meanwhile.
@@ -102,29 +106,30 @@ impl Hub {
     /// an ended job stays as it is.
     pub(crate) async fn end_job(
         &self,
-        job: &JobId,
+        job: JobId,
         trigger: JobTrigger,
-        failure: Option<&Failure>,
+        failure: Option<Failure>,
     ) -> Result<JobState, StoreError> {
         let mut desk = self.desk.lock().await;
         let mut change = self.store.change().await?;
-        let before = change.job_state(job).await?;
+        let before = change.job_state(&job).await?;
         let Ok(next) = before.after(trigger) else { return Ok(before) };
-        let leases = desk.queue.cancel_job(job);
+        let leases = desk.queue.cancel_job(&job);
         for lease in &leases {
             change.end_attempt(&lease.id, AttemptOutcome::Cancelled).await?;
         }
-        cancel_open_frames(&mut change, job, self).await?;
-        change.set_job_state(job, next, failure).await?;
-        change.append_job_event(job, next, failure).await?;
+        cancel_open_frames(&mut change, &job, self).await?;
+        change.set_job_state(&job, next, failure.as_ref()).await?;
+        change.append_job_event(&job, next, failure.as_ref()).await?;
         change.commit().await?;
-        tracing::info!(job_id = %job, state = next.label(), reason = failure.map(|f| f.message.as_str()), "job ended");
+        let reason = failure.as_ref().map_or("", |failure| failure.message.as_str());
+        tracing::info!(job_id = %job, state = next.label(), reason, "job ended");
         for lease in leases {
             let reason = format!("the job is {}", next.label());
             desk.send(lease.session, Message::CancelLease(CancelLease { lease_id: lease.id, reason }));
         }
-        self.retire(&mut desk, job);
-        self.tell_stored(job);
+        self.retire(&mut desk, &job);
+        self.tell_stored(&job);
         Ok(next)
     }
 
@@ -159,20 +164,9 @@ impl Hub {
         if !self.options.dismiss_workers_when_idle || !desk.has_worked || !desk.active.is_empty() {
             return;
         }
-        self.dismiss_all(desk, "no job is left");
-    }
-
-    /// The coordinator shuts down: workers of an embedded one go with it.
-    pub(crate) async fn dismiss_at_shutdown(&self) {
-        if self.options.dismiss_workers_when_idle {
-            self.dismiss_all(&mut *self.desk.lock().await, "the coordinator shuts down");
-        }
-    }
-
-    fn dismiss_all(&self, desk: &mut Desk, reason: &str) {
         let sessions: Vec<_> = desk.sessions.keys().copied().collect();
         for session in sessions {
-            desk.send(session, Message::Dismiss(Dismiss { reason: reason.to_owned() }));
+            desk.send(session, Message::Dismiss(Dismiss { reason: "no job is left".into() }));
         }
     }
 }

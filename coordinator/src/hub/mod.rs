@@ -23,8 +23,8 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{Blob, JobEvent, Progress, WorkersChanged, job_event::Event};
 
-pub(crate) use self::sessions::{OUTGOING_QUEUE, SharedHub};
 use self::sessions::Session;
+pub(crate) use self::sessions::{OUTGOING_QUEUE, Registered, SharedHub};
 use crate::{
     blobs::BlobStore,
     compute::Compute,
@@ -49,6 +49,8 @@ pub(crate) enum Notice {
 pub(crate) struct FrameBase {
     pub(crate) model: Gaussians,
     pub(crate) blob: Blob,
+    /// The blob's digest as bytes.
+    pub(crate) digest: [u8; 32],
     pub(crate) output: PathBuf,
 }
 
@@ -140,10 +142,17 @@ impl Hub {
         self.options.root.join("blobs")
     }
 
+    /// Folder of frames that were decoded from videos.
+    pub(crate) fn scratch_folder(&self) -> PathBuf {
+        self.options.root.join("decoded")
+    }
+
     /// Paths under the root that are no job's output.
     pub(crate) fn private_paths(&self) -> Vec<PathBuf> {
         let root = &self.options.root;
-        ["state.sqlite", "state.sqlite-wal", "state.sqlite-shm", "blobs", "jobs"].map(|name| root.join(name)).into()
+        ["state.sqlite", "state.sqlite-wal", "state.sqlite-shm", "lock", "blobs", "decoded", "jobs"]
+            .map(|name| root.join(name))
+            .into()
     }
 
     /// The coordinator cannot go on: it ends, and a restart goes on from what is written.

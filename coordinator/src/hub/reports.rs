@@ -132,19 +132,16 @@ impl Hub {
     }
 
     /// The delta exists, is what its name says, fits the static model and is finite; then the frame's file is written.
-    async fn verify(
-        &self,
-        lease: &Lease,
-        base: Arc<FrameBase>,
-        success: &Success,
-    ) -> Result<Blob, Failure> {
+    async fn verify(&self, lease: &Lease, base: Arc<FrameBase>, success: &Success) -> Result<Blob, Failure> {
         let bug = |message: String| failure(FailureKind::Bug, message);
         let delta = success.delta.clone().ok_or_else(|| bug("the worker's result names no delta".into()))?;
         check_report(&success.report_json).map_err(bug)?;
         let bytes = self.blobs.get(&delta).await.map_err(|error| {
             let kind = match &error {
                 BlobError::Name(_) | BlobError::TooLarge { .. } => FailureKind::Bug,
-                BlobError::Missing(_) | BlobError::Corrupt { .. } | BlobError::Store(_) => FailureKind::Transient,
+                BlobError::Missing(_) | BlobError::Corrupt { .. } | BlobError::Store(_) => {
+                    FailureKind::Transient
+                }
             };
             failure(kind, format!("the worker's delta: {error}"))
         })?;
@@ -166,8 +163,9 @@ impl Hub {
     ) -> Result<(), StageError> {
         let work = move || {
             let bug = |message: String| StageError::new(FailureKind::Bug, message);
-            let gaussians = delta::apply(&base.model, &base.blob.digest, &bytes)
-                .map_err(|error| bug(format!("the delta of frame {frame} does not fit the static model: {error}")))?;
+            let gaussians = delta::apply(&base.model, &base.digest, &bytes).map_err(|error| {
+                bug(format!("the delta of frame {frame} does not fit the static model: {error}"))
+            })?;
             validate::validate(&gaussians)
                 .map_err(|error| bug(format!("the Gaussians of frame {frame} are not valid: {error}")))?;
             assembly::write_frame(&base.output, frame, &base.model, &base.blob.digest, &bytes)
@@ -182,7 +180,10 @@ impl Hub {
 
 fn check_report(json: &str) -> Result<(), String> {
     if json.len() > MAX_REPORT_BYTES {
-        return Err(format!("the worker's report has {} bytes, at most {MAX_REPORT_BYTES} are accepted", json.len()));
+        return Err(format!(
+            "the worker's report has {} bytes, at most {MAX_REPORT_BYTES} are accepted",
+            json.len()
+        ));
     }
     // JSON has neither NaN nor infinity: a report with one of them is not readable.
     serde_json::from_str::<FrameReport>(json)

@@ -70,10 +70,11 @@ impl Hub {
         Ok(Registered { session, close })
     }
 
-    /// A worker's stream is gone.
+    /// A worker's stream is gone. At shutdown this is the coordinator's own doing: the lease is void after the restart
+    /// and does not count as failed.
     pub(crate) async fn disconnected(&self, session: SessionId) -> Result<(), StoreError> {
         let mut desk = self.desk.lock().await;
-        if !desk.sessions.contains_key(&session) {
+        if self.shutdown.is_cancelled() || !desk.sessions.contains_key(&session) {
             return Ok(());
         }
         self.lose(&mut desk, session, "the connection to the worker broke").await?;
@@ -137,8 +138,13 @@ impl Hub {
         let mut desk = self.desk.lock().await;
         match desk.queue.heartbeat(session, &lease_id, attempt, Instant::now()) {
             Ok(lease) => {
-                let progress =
-                    Progress { stage, frame: lease.key.frame, done, total, worker_id: lease.worker_id.clone() };
+                let progress = Progress {
+                    stage,
+                    frame: lease.key.frame,
+                    done,
+                    total,
+                    worker_id: lease.worker_id.clone(),
+                };
                 self.tell(Notice::Transient(lease.key.job.clone(), Event::Progress(progress)));
             }
             Err(stale) => {

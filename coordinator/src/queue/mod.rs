@@ -192,7 +192,10 @@ impl Queue {
             .filter_map(|(&id, session)| Some((session.ticket?, id)))
             .collect();
         waiting.sort_unstable();
-        waiting.into_iter().filter_map(|(_, session)| self.lease_next(session, now, &mut new_lease_id)).collect()
+        waiting
+            .into_iter()
+            .filter_map(|(_, session)| self.lease_next(session, now, &mut new_lease_id))
+            .collect()
     }
 
     fn lease_next(

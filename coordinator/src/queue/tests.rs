@@ -40,7 +40,8 @@ impl Bench {
     }
 
     fn fail(&mut self, lease: &Lease, kind: FailureKind) -> FailedLease {
-        let failed = self.queue.fail(lease.session, &lease.id, lease.attempt, kind).expect("the lease is held");
+        let failed =
+            self.queue.fail(lease.session, &lease.id, lease.attempt, kind).expect("the lease is held");
         self.queue.park(lease.session);
         failed
     }

@@ -43,7 +43,10 @@ impl Blobs for BlobService {
         Ok(Response::new(messages.boxed()))
     }
 
-    async fn put(&self, request: Request<Streaming<PutBlobChunk>>) -> Result<Response<PutBlobResponse>, Status> {
+    async fn put(
+        &self,
+        request: Request<Streaming<PutBlobChunk>>,
+    ) -> Result<Response<PutBlobResponse>, Status> {
         let mut chunks = request.into_inner();
         let first = next(&mut chunks).await?;
         let Some(PutBlobChunk { blob: Some(blob), data }) = first else {
@@ -76,7 +79,10 @@ async fn receive(
 
 async fn next(chunks: &mut Streaming<PutBlobChunk>) -> Result<Option<PutBlobChunk>, Status> {
     tokio::time::timeout(UPLOAD_SILENCE, chunks.message()).await.unwrap_or_else(|_| {
-        Err(Status::deadline_exceeded(format!("no chunk for {} s; put the blob again", UPLOAD_SILENCE.as_secs())))
+        Err(Status::deadline_exceeded(format!(
+            "no chunk for {} s; put the blob again",
+            UPLOAD_SILENCE.as_secs()
+        )))
     })
 }
 

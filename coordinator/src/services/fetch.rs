@@ -59,7 +59,10 @@ fn wanted_files(
 ) -> Result<Vec<(String, PathBuf)>, Status> {
     if paths.is_empty() {
         let files = list_files(output, private).map_err(|error| {
-            Status::failed_precondition(format!("the output folder {}: {error}; was it removed?", output.display()))
+            Status::failed_precondition(format!(
+                "the output folder {}: {error}; was it removed?",
+                output.display()
+            ))
         })?;
         let named = |file: PathBuf| (file.to_string_lossy().into_owned(), output.join(file));
         return Ok(files.into_iter().map(named).collect());
@@ -68,7 +71,9 @@ fn wanted_files(
         Some(file) => Ok((path, file)),
         None => {
             let path: String = path.chars().take(200).collect();
-            Err(Status::not_found(format!("no file '{path}' in the output folder; fetch without paths to get all")))
+            Err(Status::not_found(format!(
+                "no file '{path}' in the output folder; fetch without paths to get all"
+            )))
         }
     };
     paths.into_iter().map(known).collect()

@@ -7,7 +7,7 @@ use trackersplat_proto::v1::{
     SubmitRequest, SubmitResponse, WatchRequest, jobs_server::Jobs,
 };
 
-use super::{fetch, state_failed, submit, unknown_job, watch};
+use super::{fetch, state_failed, submit, uninterrupted, unknown_job, watch};
 use crate::{
     hub::SharedHub,
     queue::job::JobTrigger,
@@ -36,7 +36,10 @@ impl Jobs for JobService {
     type FetchStream = ReceiverStream<Result<FetchChunk, Status>>;
 
     async fn submit(&self, request: Request<SubmitRequest>) -> Result<Response<SubmitResponse>, Status> {
-        submit::submit(&self.hub, request.into_inner()).await.map(Response::new)
+        let hub = self.hub.clone();
+        uninterrupted(async move { submit::submit(&hub, request.into_inner()).await })
+            .await
+            .map(Response::new)
     }
 
     async fn watch(&self, request: Request<WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
@@ -61,8 +64,12 @@ impl Jobs for JobService {
     async fn cancel(&self, request: Request<CancelRequest>) -> Result<Response<CancelResponse>, Status> {
         let id = request.into_inner().job_id;
         self.job(&id).await?;
-        let state = self.hub.end_job(&id.into(), JobTrigger::Cancel, None).await;
-        let state = state.map_err(|error| state_failed(&self.hub, error))?;
+        let hub = self.hub.clone();
+        let cancel = async move {
+            let state = hub.end_job(id.into(), JobTrigger::Cancel, None).await;
+            state.map_err(|error| state_failed(&hub, error))
+        };
+        let state = uninterrupted(cancel).await?;
         Ok(Response::new(CancelResponse { state: state.to_wire().into() }))
     }
 

@@ -26,3 +26,11 @@ fn unknown_job(job: &str) -> Status {
     let job: String = job.chars().take(80).collect();
     Status::not_found(format!("no job '{job}'; list the jobs to see their ids"))
 }
+
+/// Runs a change to its end even if the client hangs up, so that queue and database never differ.
+async fn uninterrupted<T: Send + 'static>(
+    change: impl Future<Output = Result<T, Status>> + Send + 'static,
+) -> Result<T, Status> {
+    let ended = tokio::spawn(change).await;
+    ended.unwrap_or_else(|error| Err(Status::internal(format!("the request did not end: {error}"))))
+}

@@ -14,6 +14,7 @@ use trackersplat_proto::v1::{SubmitRequest, SubmitResponse, submit_request::Trac
 
 use super::state_failed;
 use crate::{
+    assembly::SEQUENCE,
     hub::{Hub, SharedHub},
     keys::VERSION,
     output::{self, Marker, OutputError},
@@ -21,11 +22,6 @@ use crate::{
     request::{InputFile, JobRequest, TrackSource},
     store::{JobRecord, NewJob},
 };
-
-/// Decoded images that a clip may keep in memory.
-const CLIP_CACHE_BYTES: u64 = 256 << 20;
-/// File that exists once a job's outputs are complete.
-const MANIFEST: &str = "sequence.json";
 
 /// A submission that was read and found possible.
 struct Submission {
@@ -43,10 +39,11 @@ pub(super) async fn submit(hub: &SharedHub, request: SubmitRequest) -> Result<Su
     if hub.shutdown.is_cancelled() {
         return Err(Status::unavailable("the coordinator shuts down; submit again when it is back"));
     }
-    let reading = tokio::task::spawn_blocking(move || read(request)).await;
+    let _one_at_a_time = hub.submitting.lock().await;
+    let scratch = hub.scratch_folder();
+    let reading = tokio::task::spawn_blocking(move || read(request, scratch)).await;
     let submission =
         reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))??;
-    let _one_at_a_time = hub.submitting.lock().await;
     let known = hub
         .store
         .same_job(&submission.clip_digest, &submission.settings_digest, &submission.output_request)
@@ -63,7 +60,7 @@ async fn resume(hub: &SharedHub, job: JobRecord, submission: Submission) -> Resu
     let output = PathBuf::from(&job.output);
     let response = SubmitResponse { job_id: job.id.clone(), resumed: true };
     // A finished job whose outputs were removed puts them together again.
-    let is_complete = state == JobState::Done && output.join(MANIFEST).exists();
+    let is_complete = state == JobState::Done && output.join(SEQUENCE).exists();
     if is_complete || !state.has_ended() {
         return Ok(response);
     }
@@ -119,7 +116,7 @@ async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) 
     output::claim(output, &marker).map_err(refused)
 }
 
-fn read(request: SubmitRequest) -> Result<Submission, Status> {
+fn read(request: SubmitRequest, scratch: PathBuf) -> Result<Submission, Status> {
     let settings = read_settings(&request.settings_json)?;
     let clip_path = local_path("clip", &request.clip)?;
     let mut job_request = JobRequest {
@@ -132,7 +129,7 @@ fn read(request: SubmitRequest) -> Result<Submission, Status> {
         tracks: read_tracks(request.tracks)?,
         ..JobRequest::default()
     };
-    let options = job_request.clip_options(CLIP_CACHE_BYTES);
+    let options = job_request.clip_options(scratch);
     let bad_clip = |error: splat::clip::ClipError| Status::invalid_argument(error.to_string());
     let clip = Clip::open(&clip_path, &options).map_err(bad_clip)?;
     if clip.frames().is_empty() {
@@ -152,7 +149,15 @@ fn read(request: SubmitRequest) -> Result<Submission, Status> {
     };
     let settings_digest = job_request.settings_digest(&settings);
     let clip = Arc::new(clip);
-    Ok(Submission { clip_path, clip, clip_digest, settings, settings_digest, request: job_request, output_request })
+    Ok(Submission {
+        clip_path,
+        clip,
+        clip_digest,
+        settings,
+        settings_digest,
+        request: job_request,
+        output_request,
+    })
 }
 
 /// Empty: the defaults. An unknown key is refused by name.
@@ -192,7 +197,10 @@ fn input_file(what: &str, path: &str) -> Result<InputFile, Status> {
     let mut hasher = blake3::Hasher::new();
     let read = std::fs::File::open(&path).and_then(|file| hasher.update_reader(file).map(|_| ()));
     read.map_err(|error| {
-        Status::invalid_argument(format!("{what} {}: {error}; check that the file is there and may be read", path.display()))
+        Status::invalid_argument(format!(
+            "{what} {}: {error}; check that the file is there and may be read",
+            path.display()
+        ))
     })?;
     Ok(InputFile { path: path.display().to_string(), digest: hasher.finalize().to_hex().to_string() })
 }
@@ -200,7 +208,9 @@ fn input_file(what: &str, path: &str) -> Result<InputFile, Status> {
 /// An absolute path from a path or a `file://` URL.
 fn local_path(what: &str, given: &str) -> Result<PathBuf, Status> {
     let wrong = |reason: &str| {
-        Status::invalid_argument(format!("{what} '{given}' {reason}; give a path on the coordinator's machine or a file:// URL"))
+        Status::invalid_argument(format!(
+            "{what} '{given}' {reason}; give a path on the coordinator's machine or a file:// URL"
+        ))
     };
     let path = match given.split_once("://") {
         Some(("file", path)) => percent_decoded(path).ok_or_else(|| wrong("is no valid URL"))?,

@@ -4,18 +4,19 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
 use tonic::{Request, Response, Status, Streaming};
 use trackersplat_proto::{
     ids::check_worker_id,
     v1::{
-        CoordinatorMessage, Register, Welcome, WorkerMessage, coordinator_message, worker_message::Message,
-        workers_server::Workers,
+        CoordinatorMessage, Dismiss, Register, Welcome, WorkerMessage, coordinator_message,
+        worker_message::Message, workers_server::Workers,
     },
 };
 
 use super::state_failed;
 use crate::{
-    hub::{OUTGOING_QUEUE, SharedHub},
+    hub::{OUTGOING_QUEUE, Registered, SharedHub},
     keys::VERSION,
     queue::SessionId,
     store::StoreError,
@@ -37,13 +38,14 @@ impl WorkService {
     }
 }
 
-type Outgoing = mpsc::Sender<Result<CoordinatorMessage, Status>>;
-
 #[tonic::async_trait]
 impl Workers for WorkService {
     type WorkStream = ReceiverStream<Result<CoordinatorMessage, Status>>;
 
-    async fn work(&self, request: Request<Streaming<WorkerMessage>>) -> Result<Response<Self::WorkStream>, Status> {
+    async fn work(
+        &self,
+        request: Request<Streaming<WorkerMessage>>,
+    ) -> Result<Response<Self::WorkStream>, Status> {
         let mut incoming = request.into_inner();
         let register = registration(&mut incoming).await?;
         let (outgoing, receiver) = mpsc::channel(OUTGOING_QUEUE);
@@ -51,27 +53,88 @@ impl Workers for WorkService {
         let welcome = coordinator_message::Message::Welcome(welcome(&self.hub));
         let welcome = CoordinatorMessage { message: Some(welcome) };
         outgoing.try_send(Ok(welcome)).map_err(|error| Status::internal(error.to_string()))?;
-        let registered = self.hub.register(&register, outgoing.clone()).await;
-        let registered = registered.map_err(|error| state_failed(&self.hub, error))?;
-        let hub = self.hub.clone();
-        tokio::spawn(async move {
-            let session = registered.session;
-            let ended = tokio::select! {
-                ended = converse(&hub, session, incoming) => ended,
-                () = outgoing.closed() => Ok(None),
-                () = registered.close.cancelled() => Ok(Some(closing_status(&hub))),
-            };
-            let gone = hub.disconnected(session).await;
-            let status = match ended.and_then(|status| gone.map(|()| status)) {
-                Ok(status) => status,
-                Err(error) => Some(state_failed(&hub, error)),
-            };
-            if let Some(status) = status {
-                // A worker that is gone needs no status.
-                let _ = outgoing.try_send(Err(status));
-            }
-        });
+        let stream = WorkerStream { hub: self.hub.clone(), incoming, outgoing };
+        tokio::spawn(stream.serve(register));
         Ok(Response::new(ReceiverStream::new(receiver)))
+    }
+}
+
+/// One worker's stream. It runs as a task of its own and never drops a change half-way: it waits for the end of the
+/// stream only between two messages.
+struct WorkerStream {
+    hub: SharedHub,
+    incoming: Streaming<WorkerMessage>,
+    outgoing: mpsc::Sender<Result<CoordinatorMessage, Status>>,
+}
+
+impl WorkerStream {
+    async fn serve(mut self, register: Register) {
+        let ended = self.register_and_converse(&register).await;
+        let status = ended.unwrap_or_else(|error| Some(state_failed(&self.hub, error)));
+        if let Some(status) = status {
+            // A worker that is gone needs no status.
+            let _ = self.outgoing.try_send(Err(status));
+        }
+    }
+
+    async fn register_and_converse(&mut self, register: &Register) -> Result<Option<Status>, StoreError> {
+        let Registered { session, close } = self.hub.register(register, self.outgoing.clone()).await?;
+        let ended = self.converse(session, &close).await;
+        self.hub.disconnected(session).await?;
+        ended
+    }
+
+    /// Handles a worker's messages until its stream ends. A status if it is this side that ends it.
+    async fn converse(
+        &mut self,
+        session: SessionId,
+        close: &CancellationToken,
+    ) -> Result<Option<Status>, StoreError> {
+        let options = &self.hub.options;
+        let patience = (options.heartbeat_interval * SILENT_PERIODS).max(options.lease_duration);
+        loop {
+            let message = tokio::select! {
+                message = tokio::time::timeout(patience, self.incoming.message()) => message,
+                () = self.outgoing.closed() => return Ok(None),
+                () = close.cancelled() => return Ok(Some(self.closing_status())),
+            };
+            let message = match message {
+                Ok(Ok(Some(message))) => message,
+                Ok(Ok(None) | Err(_)) => return Ok(None),
+                Err(_) => {
+                    return Ok(Some(Status::deadline_exceeded("no message of the worker; connect again")));
+                }
+            };
+            match message.message {
+                Some(Message::LeaseRequest(_)) => self.hub.lease_requested(session).await?,
+                Some(Message::Heartbeat(heartbeat)) => self.hub.heartbeat(session, heartbeat).await,
+                Some(Message::Report(report)) => self.hub.report(session, report).await?,
+                Some(Message::GoingAway(going)) => {
+                    self.hub.going_away(session, &going.reason).await?;
+                    return Ok(None);
+                }
+                Some(Message::Register(_)) => {
+                    return Ok(Some(Status::invalid_argument("a worker registers once per stream")));
+                }
+                // A kind of message that this version does not know is left out, as proto3 intends.
+                None => {}
+            }
+        }
+    }
+
+    fn closing_status(&self) -> Status {
+        if !self.hub.shutdown.is_cancelled() {
+            return Status::failed_precondition(
+                "another process registered as this worker, or this one read nothing; give every worker its own id",
+            );
+        }
+        if self.hub.options.dismiss_workers_when_idle {
+            // Whoever started the workers with this coordinator waits for them.
+            let dismiss = Dismiss { reason: "the coordinator shuts down".into() };
+            let message = Some(coordinator_message::Message::Dismiss(dismiss));
+            let _ = self.outgoing.try_send(Ok(CoordinatorMessage { message }));
+        }
+        Status::unavailable("the coordinator shuts down; connect again when it is back")
     }
 }
 
@@ -98,42 +161,5 @@ fn welcome(hub: &SharedHub) -> Welcome {
         lease_duration_ms: milliseconds(hub.options.lease_duration),
         store_directory: hub.blob_folder().display().to_string(),
         store_probe: Some(hub.probe.clone()),
-    }
-}
-
-fn closing_status(hub: &SharedHub) -> Status {
-    if hub.shutdown.is_cancelled() {
-        return Status::unavailable("the coordinator shuts down; connect again when it is back");
-    }
-    Status::failed_precondition("another process registered as this worker, or this one read nothing; give every worker its own id")
-}
-
-/// Handles a worker's messages until its stream ends. A status if the worker broke the protocol or fell silent.
-async fn converse(
-    hub: &SharedHub,
-    session: SessionId,
-    mut incoming: Streaming<WorkerMessage>,
-) -> Result<Option<Status>, StoreError> {
-    let patience = (hub.options.heartbeat_interval * SILENT_PERIODS).max(hub.options.lease_duration);
-    loop {
-        let message = match tokio::time::timeout(patience, incoming.message()).await {
-            Ok(Ok(Some(message))) => message,
-            Ok(Ok(None) | Err(_)) => return Ok(None),
-            Err(_) => return Ok(Some(Status::deadline_exceeded("no message of the worker; connect again"))),
-        };
-        match message.message {
-            Some(Message::LeaseRequest(_)) => hub.lease_requested(session).await?,
-            Some(Message::Heartbeat(heartbeat)) => hub.heartbeat(session, heartbeat).await,
-            Some(Message::Report(report)) => hub.report(session, report).await?,
-            Some(Message::GoingAway(going)) => {
-                hub.going_away(session, &going.reason).await?;
-                return Ok(None);
-            }
-            Some(Message::Register(_)) => {
-                return Ok(Some(Status::invalid_argument("a worker registers once per stream")));
-            }
-            // A kind of message that this version does not know is left out, as proto3 intends.
-            None => {}
-        }
     }
 }

@@ -136,11 +136,12 @@ impl Store {
                    WHERE job_id = ? AND frame = ? ORDER BY position";
         let rows: Vec<(u32, String, i64, String, i64)> =
             sqlx::query_as(sql).bind(job).bind(frame).fetch_all(&self.pool).await?;
-        let record = |(position, digest, size, mask, mask_size): (u32, String, i64, String, i64)| ImageRecord {
-            position: position as usize,
-            image: Blob { digest, size: unsigned(size) },
-            mask: (!mask.is_empty()).then(|| Blob { digest: mask, size: unsigned(mask_size) }),
-        };
+        let record =
+            |(position, digest, size, mask, mask_size): (u32, String, i64, String, i64)| ImageRecord {
+                position: position as usize,
+                image: Blob { digest, size: unsigned(size) },
+                mask: (!mask.is_empty()).then(|| Blob { digest: mask, size: unsigned(mask_size) }),
+            };
         Ok(rows.into_iter().map(record).collect())
     }
 
@@ -152,7 +153,8 @@ impl Store {
 
     /// One frame.
     pub async fn frame(&self, job: &str, frame: u32) -> Result<Option<FrameRecord>, StoreError> {
-        let query = sqlx::query_as("SELECT * FROM frames WHERE job_id = ? AND frame = ?").bind(job).bind(frame);
+        let query =
+            sqlx::query_as("SELECT * FROM frames WHERE job_id = ? AND frame = ?").bind(job).bind(frame);
         Ok(query.fetch_optional(&self.pool).await?)
     }
 
@@ -165,7 +167,11 @@ impl Store {
     }
 
     /// Kind and message of a frame's last failed attempt.
-    pub async fn last_failure(&self, job: &str, frame: u32) -> Result<Option<(FailureKind, String)>, StoreError> {
+    pub async fn last_failure(
+        &self,
+        job: &str,
+        frame: u32,
+    ) -> Result<Option<(FailureKind, String)>, StoreError> {
         let sql = "SELECT outcome, message FROM attempts WHERE job_id = ? AND frame = ? \
                    AND outcome NOT IN ('running', 'done', 'released', 'cancelled') ORDER BY attempt DESC LIMIT 1";
         let query = sqlx::query_as(sql).bind(job).bind(frame);
