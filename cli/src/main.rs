@@ -1,2 +1,33 @@
-//! cli
-fn main() {}
+//! `trackersplat`: moving 3D Gaussians from synchronized multi-view video.
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
+
+mod args;
+mod client;
+mod commands;
+mod display;
+mod embedded;
+mod error;
+mod follow;
+mod frame_range;
+mod interrupt;
+mod layers;
+mod logs;
+mod outcome;
+mod table;
+mod worker_processes;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    let cli = commands::Cli::parse();
+    logs::start(&cli.logs);
+    match commands::run(cli.command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}

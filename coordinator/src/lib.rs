@@ -1,1 +1,33 @@
-//! coordinator
+//! The coordinator: ingests a clip, reconstructs the static model, tracks it, hands frame jobs to workers, and puts
+//! the results together.
+//!
+//! | module | idea |
+//! |---|---|
+//! | [`queue`] | which frame goes to which worker, and the states of jobs and frames: pure tables, time is a parameter |
+//! | [`store`] | the state on disk, one SQLite file |
+//! | [`blobs`] | bulk bytes named by digest |
+//! | `hub` | where jobs, workers and clients meet: one lock orders every change |
+//! | `driver` | a job from submission to its end, one file per stage |
+//! | `services` | the gRPC services of `trackersplat.v1`; `proto/PROTOCOL.md` is their reference |
+//! | [`assembly`] | the finished frames become files |
+
+pub mod assembly;
+pub mod blobs;
+mod compute;
+mod convert;
+mod driver;
+mod failure;
+mod hub;
+mod keys;
+mod options;
+mod output;
+pub mod queue;
+mod request;
+mod serve;
+mod services;
+pub mod store;
+#[cfg(test)]
+mod tests;
+
+pub use options::ServeOptions;
+pub use serve::{Running, ServeError, serve};

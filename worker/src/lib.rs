@@ -1,1 +1,19 @@
-//! worker
+//! The worker: owns one device, leases frame jobs from a coordinator, runs them and reports the results.
+//!
+//! | file | idea |
+//! |---|---|
+//! | `run.rs` | what a worker does with each message, from registration to dismissal |
+//! | `connection.rs` | one bidirectional stream to the coordinator, and getting it back |
+//! | `job.rs` | a frame job from the wire to a report |
+//! | `inputs.rs` | checked conversion of a frame job's blobs to what `splat` takes |
+//! | `blobs.rs` | verified bulk, from the store's directory or through the coordinator |
+
+mod blobs;
+mod connection;
+mod inputs;
+mod job;
+mod run;
+#[cfg(test)]
+mod test_coordinator;
+
+pub use run::{Exit, WorkerError, WorkerOptions, run};

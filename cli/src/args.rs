@@ -1,0 +1,219 @@
+//! Options that several commands share.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use splat::settings::{MotionSource, Quality};
+use trackersplat_proto::v1::{ExactTracks, SubmitRequest, TrackFiles, submit_request::Tracks};
+
+use crate::{error::CliError, frame_range::FrameRange, layers::SettingsLayers};
+
+/// Where the pieces that run by hand find each other by default.
+pub(crate) const DEFAULT_COORDINATOR: &str = "http://127.0.0.1:7700";
+
+/// A coordinator to talk to.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct CoordinatorArgs {
+    /// Address of the coordinator.
+    #[arg(long, value_name = "URL", default_value = DEFAULT_COORDINATOR, env = "TRACKERSPLAT_COORDINATOR")]
+    pub(crate) coordinator: String,
+}
+
+/// What to reconstruct and how.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct JobArgs {
+    /// Folder of the clip: COLMAP, nerfstudio transforms, or LLFF/N3DV.
+    pub(crate) clip: String,
+
+    /// Frames to reconstruct, first and last; the first is the key frame [default: all].
+    #[arg(long, value_name = "1..10", help_heading = "Input")]
+    pub(crate) frames: Option<FrameRange>,
+
+    /// Views to hold out for evaluation [default: the data set's test views].
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', help_heading = "Input")]
+    pub(crate) test_views: Vec<String>,
+
+    /// Gaussian PLY that replaces the reconstruction of the key frame.
+    #[arg(long, value_name = "FILE", help_heading = "Input")]
+    pub(crate) static_model: Option<PathBuf>,
+
+    /// Where tracks come from: `exact` reads the clip's flow/<view>.npz, files are npz per training view [default:
+    /// the built-in tracker].
+    #[arg(long, value_name = "exact|FILE", num_args = 1.., help_heading = "Input")]
+    pub(crate) tracks: Vec<String>,
+
+    #[command(flatten)]
+    pub(crate) settings: SettingsArgs,
+}
+
+/// How to reconstruct.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct SettingsArgs {
+    /// How much time to trade for accuracy.
+    #[arg(long, value_enum, default_value_t, help_heading = "Reconstruction")]
+    pub(crate) quality: QualityArg,
+
+    /// Where frames start from [default: tracks].
+    #[arg(long, value_enum, help_heading = "Reconstruction")]
+    pub(crate) motion: Option<MotionArg>,
+
+    /// Seed of every random choice [default: 0].
+    #[arg(long, help_heading = "Reconstruction")]
+    pub(crate) seed: Option<u64>,
+
+    /// TOML file of settings, over the preset of --quality.
+    #[arg(long, value_name = "FILE", help_heading = "Reconstruction")]
+    pub(crate) settings: Option<PathBuf>,
+
+    /// One setting by its dotted key, over --settings; may be repeated.
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "Reconstruction")]
+    pub(crate) set: Vec<String>,
+}
+
+/// [`Quality`] on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub(crate) enum QualityArg {
+    /// A look at the result.
+    Draft,
+    /// The default.
+    #[default]
+    Balanced,
+    /// The paper's budget.
+    Best,
+}
+
+/// [`MotionSource`] on the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum MotionArg {
+    /// From the tracks, by motion compensation.
+    Tracks,
+    /// From the static model as it is: the baseline.
+    None,
+}
+
+impl From<QualityArg> for Quality {
+    fn from(quality: QualityArg) -> Self {
+        match quality {
+            QualityArg::Draft => Self::Draft,
+            QualityArg::Balanced => Self::Balanced,
+            QualityArg::Best => Self::Best,
+        }
+    }
+}
+
+impl From<MotionArg> for MotionSource {
+    fn from(motion: MotionArg) -> Self {
+        match motion {
+            MotionArg::Tracks => Self::Tracks,
+            MotionArg::None => Self::None,
+        }
+    }
+}
+
+impl JobArgs {
+    /// The submission for a coordinator; paths become absolute, because it runs in another folder.
+    pub(crate) fn request(&self, output: Option<&Path>) -> Result<SubmitRequest, CliError> {
+        let layers = SettingsLayers {
+            quality: self.settings.quality.into(),
+            file: self.settings.settings.as_deref(),
+            assignments: &self.settings.set,
+            motion: self.settings.motion.map(Into::into),
+            seed: self.settings.seed,
+        };
+        let settings_json = serde_json::to_string(&layers.resolve()?)
+            .map_err(|error| CliError::failed("the settings as JSON", error))?;
+        let frames = self.frames.unwrap_or(FrameRange { first: 0, last: 0 });
+        Ok(SubmitRequest {
+            clip: absolute(&self.clip)?,
+            output: output.map(|output| absolute(&output.to_string_lossy())).transpose()?.unwrap_or_default(),
+            first_frame: frames.first,
+            last_frame: frames.last,
+            test_views: self.test_views.clone(),
+            settings_json,
+            static_model: match &self.static_model {
+                Some(file) => absolute(&file.to_string_lossy())?,
+                None => String::new(),
+            },
+            tracks: self.tracks()?,
+        })
+    }
+
+    fn tracks(&self) -> Result<Option<Tracks>, CliError> {
+        match self.tracks.as_slice() {
+            [] => Ok(None),
+            [one] if one == "exact" => Ok(Some(Tracks::ExactTracks(ExactTracks {}))),
+            files if files.iter().any(|file| file == "exact") => {
+                let why = "'exact' stands alone; give it without files, or only files (./exact for a file of that name)";
+                Err(CliError::bad_input("--tracks", why))
+            }
+            files => {
+                let paths = files.iter().map(|file| absolute(file)).collect::<Result<_, _>>()?;
+                Ok(Some(Tracks::TrackFiles(TrackFiles { paths })))
+            }
+        }
+    }
+}
+
+/// An absolute path; URLs stay as they are.
+fn absolute(path: &str) -> Result<String, CliError> {
+    if path.contains("://") {
+        return Ok(path.to_owned());
+    }
+    let absolute = std::path::absolute(path).map_err(|error| CliError::bad_input(format!("path '{path}'"), error))?;
+    Ok(absolute.to_string_lossy().into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        job: JobArgs,
+    }
+
+    fn request(line: &[&str]) -> Result<SubmitRequest, CliError> {
+        Line::try_parse_from(std::iter::once("x").chain(line.iter().copied())).unwrap().job.request(None)
+    }
+
+    #[test]
+    fn a_plain_line_asks_for_everything_the_clip_has() {
+        let request = request(&["clip"]).unwrap();
+        assert!(Path::new(&request.clip).is_absolute() && request.clip.ends_with("/clip"));
+        assert_eq!((request.first_frame, request.last_frame), (0, 0));
+        assert_eq!(request.tracks, None);
+        assert!(request.output.is_empty() && request.static_model.is_empty() && request.test_views.is_empty());
+    }
+
+    #[test]
+    fn every_flag_reaches_the_submission() {
+        let line = [
+            "file:///clip", "--frames", "2..5", "--test-views", "a,b", "--static-model", "/m.ply", "--tracks", "exact",
+            "--seed", "9", "--motion", "none",
+        ];
+        let request = request(&line).unwrap();
+        assert_eq!(request.clip, "file:///clip");
+        assert_eq!((request.first_frame, request.last_frame), (2, 5));
+        assert_eq!(request.test_views, ["a", "b"]);
+        assert_eq!(request.static_model, "/m.ply");
+        assert!(matches!(request.tracks, Some(Tracks::ExactTracks(_))));
+        let settings: splat::settings::Settings = serde_json::from_str(&request.settings_json).unwrap();
+        assert_eq!((settings.seed, settings.motion_source), (9, MotionSource::None));
+    }
+
+    #[test]
+    fn track_files_are_absolute_and_exact_stands_alone() {
+        let Some(Tracks::TrackFiles(files)) = request(&["clip", "--tracks", "a.npz", "/b.npz"]).unwrap().tracks else {
+            panic!("track files");
+        };
+        assert!(files.paths[0].ends_with("/a.npz") && Path::new(&files.paths[0]).is_absolute());
+        assert_eq!(files.paths[1], "/b.npz");
+        let error = request(&["clip", "--tracks", "exact", "a.npz"]).unwrap_err();
+        assert_eq!(error.exit_code(), 3);
+    }
+}

@@ -1,0 +1,44 @@
+//! Logs go to standard error; results to standard output.
+
+use std::io::IsTerminal;
+
+use clap::{ArgAction, Args};
+use tracing_subscriber::{EnvFilter, filter::LevelFilter};
+
+/// How much to say, and how.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct LogArgs {
+    /// Say more; twice: everything.
+    #[arg(short, long, action = ArgAction::Count, global = true, conflicts_with = "quiet", help_heading = "Logs")]
+    pub(crate) verbose: u8,
+
+    /// Say errors only, and draw no progress.
+    #[arg(short, long, global = true, help_heading = "Logs")]
+    pub(crate) quiet: bool,
+
+    /// Logs as JSON, one object per line.
+    #[arg(long, global = true, help_heading = "Logs")]
+    pub(crate) log_json: bool,
+}
+
+/// Starts logging. `RUST_LOG` overrules the flags.
+pub(crate) fn start(args: &LogArgs) {
+    let filter = EnvFilter::builder().with_default_directive(level(args).into()).from_env_lossy();
+    let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    if args.log_json {
+        logs.json().init();
+    } else {
+        logs.with_target(false).with_ansi(std::io::stderr().is_terminal()).init();
+    }
+}
+
+/// Progress bars take the place of the ordinary lines on a terminal.
+fn level(args: &LogArgs) -> LevelFilter {
+    match args.verbose {
+        _ if args.quiet => LevelFilter::ERROR,
+        0 if std::io::stderr().is_terminal() && !args.log_json => LevelFilter::WARN,
+        0 => LevelFilter::INFO,
+        1 => LevelFilter::DEBUG,
+        _ => LevelFilter::TRACE,
+    }
+}

@@ -1,0 +1,187 @@
+//! Jobs begin, change state, and end.
+
+use std::{path::PathBuf, sync::Arc};
+
+use splat::clip::Clip;
+use tokio::sync::Notify;
+use trackersplat_proto::v1::{CancelLease, Dismiss, Failure, coordinator_message::Message};
+
+use super::{ActiveJob, Desk, FrameBase, Hub};
+use crate::{
+    driver,
+    failure::StageError,
+    queue::{
+        JobId,
+        frame::{FrameState, FrameTrigger},
+        job::{JobState, JobTrigger},
+    },
+    store::{AttemptOutcome, Change, NewJob, StoreError},
+};
+
+impl Hub {
+    /// After a start: leases of the coordinator before are void, and its jobs go on.
+    pub(crate) async fn recover(self: &Arc<Self>) -> Result<(), StoreError> {
+        let mut change = self.store.change().await?;
+        change.all_workers_gone().await?;
+        for (job, frame, attempt, lease_id, worker) in change.orphaned_leases().await? {
+            change.end_attempt(&lease_id, AttemptOutcome::Released("the coordinator was restarted")).await?;
+            change.release_frame(&job, frame, attempt, &worker).await?;
+            tracing::info!(job_id = job, frame, attempt, "lease of the former coordinator is void");
+        }
+        change.commit().await?;
+        for job in self.store.jobs().await? {
+            if !job.state()?.has_ended() {
+                tracing::info!(job_id = job.id, state = job.state()?.label(), "job goes on");
+                self.activate(&job.id, None).await;
+            }
+        }
+        Ok(())
+    }
+
+    /// A new job begins.
+    pub(crate) async fn create_job(
+        self: &Arc<Self>,
+        job: &NewJob,
+        clip: Arc<Clip>,
+    ) -> Result<(), StoreError> {
+        let mut change = self.store.change().await?;
+        change.insert_job(job).await?;
+        change.append_job_event(&job.id, JobState::Ingesting, None).await?;
+        change.commit().await?;
+        tracing::info!(job_id = job.id, clip = job.clip, output = job.output, "job submitted");
+        self.activate(&job.id, Some(clip)).await;
+        Ok(())
+    }
+
+    /// An ended job begins again with what it has; failed and cancelled frames get all their attempts again.
+    pub(crate) async fn resubmit_job(self: &Arc<Self>, job: &str, clip: Arc<Clip>) -> Result<(), StoreError> {
+        let mut change = self.store.change().await?;
+        let Ok(next) = change.job_state(job).await?.after(JobTrigger::Resubmit) else { return Ok(()) };
+        change.set_job_state(job, next, None).await?;
+        change.append_job_event(job, next, None).await?;
+        for frame in change.reopen_frames(job).await? {
+            change.append_ready_event(job, frame).await?;
+        }
+        change.commit().await?;
+        tracing::info!(job_id = job, "job submitted again");
+        self.activate(job, Some(clip)).await;
+        Ok(())
+    }
+
+    async fn activate(self: &Arc<Self>, id: &str, clip: Option<Arc<Clip>>) {
+        let id: JobId = id.into();
+        let active = ActiveJob {
+            stop: self.shutdown.child_token(),
+            frame_ended: Arc::new(Notify::new()),
+            clip,
+            base: None,
+            told: None,
+        };
+        let (stop, frame_ended) = (active.stop.clone(), active.frame_ended.clone());
+        let clip = active.clip.clone();
+        self.desk.lock().await.active.insert(id.clone(), active);
+        self.tell_stored(&id);
+        let hub = self.clone();
+        self.spawn_driver(driver::run(hub, id, stop, frame_ended, clip));
+    }
+
+    /// The job's stage ended well. `Stopped` if somebody ended the job meanwhile.
+    pub(crate) async fn advance(&self, job: &JobId) -> Result<JobState, StageError> {
+        let mut desk = self.desk.lock().await;
+        let mut change = self.store.change().await?;
+        let before = change.job_state(job).await?;
+        let Ok(next) = before.after(JobTrigger::StageDone) else { return Err(StageError::Stopped) };
+        change.set_job_state(job, next, None).await?;
+        change.append_job_event(job, next, None).await?;
+        change.commit().await?;
+        tracing::info!(job_id = %job, state = next.label(), "job state");
+        if next.has_ended() {
+            self.retire(&mut desk, job);
+        }
+        self.tell_stored(job);
+        Ok(next)
+    }
+
+    /// Ends a job by cancelling or failing it: its open frames are cancelled, their workers told. Returns its state;
+    /// an ended job stays as it is.
+    pub(crate) async fn end_job(
+        &self,
+        job: JobId,
+        trigger: JobTrigger,
+        failure: Option<Failure>,
+    ) -> Result<JobState, StoreError> {
+        let mut desk = self.desk.lock().await;
+        let mut change = self.store.change().await?;
+        let before = change.job_state(&job).await?;
+        let Ok(next) = before.after(trigger) else { return Ok(before) };
+        let leases = desk.queue.cancel_job(&job);
+        for lease in &leases {
+            change.end_attempt(&lease.id, AttemptOutcome::Cancelled).await?;
+        }
+        cancel_open_frames(&mut change, &job, self).await?;
+        change.set_job_state(&job, next, failure.as_ref()).await?;
+        change.append_job_event(&job, next, failure.as_ref()).await?;
+        change.commit().await?;
+        let reason = failure.as_ref().map_or("", |failure| failure.message.as_str());
+        tracing::info!(job_id = %job, state = next.label(), reason, "job ended");
+        for lease in leases {
+            let reason = format!("the job is {}", next.label());
+            desk.send(lease.session, Message::CancelLease(CancelLease { lease_id: lease.id, reason }));
+        }
+        self.retire(&mut desk, &job);
+        self.tell_stored(&job);
+        Ok(next)
+    }
+
+    /// What the results of a job's frames are verified against from now on.
+    pub(crate) async fn set_frame_base(&self, job: &JobId, base: Arc<FrameBase>) {
+        if let Some(active) = self.desk.lock().await.active.get_mut(job) {
+            active.base = Some(base);
+        }
+    }
+
+    /// Output folders of jobs that have not ended, with their names.
+    pub(crate) async fn active_outputs(&self) -> Result<Vec<(String, PathBuf)>, StoreError> {
+        let mut outputs = Vec::new();
+        for job in self.store.jobs().await? {
+            if !job.state()?.has_ended() {
+                outputs.push((job.id, PathBuf::from(job.output)));
+            }
+        }
+        Ok(outputs)
+    }
+
+    fn retire(&self, desk: &mut Desk, job: &JobId) {
+        if let Some(active) = desk.active.remove(job) {
+            active.stop.cancel();
+        }
+        desk.has_worked = true;
+        self.dismiss_if_idle(desk);
+    }
+
+    /// An embedded coordinator lets its workers go once there is nothing left for them.
+    pub(super) fn dismiss_if_idle(&self, desk: &mut Desk) {
+        if !self.options.dismiss_workers_when_idle || !desk.has_worked || !desk.active.is_empty() {
+            return;
+        }
+        let sessions: Vec<_> = desk.sessions.keys().copied().collect();
+        for session in sessions {
+            desk.send(session, Message::Dismiss(Dismiss { reason: "no job is left".into() }));
+        }
+    }
+}
+
+async fn cancel_open_frames(change: &mut Change, job: &JobId, hub: &Hub) -> Result<(), StoreError> {
+    for frame in hub.store.frames(job).await? {
+        let Ok(next) = frame.state()?.after(FrameTrigger::Cancel) else { continue };
+        debug_assert_eq!(next, FrameState::Cancelled);
+        change.set_frame_state(job, frame.frame, next).await?;
+        let event = crate::store::FrameEvent {
+            frame: frame.frame,
+            attempt: frame.attempts,
+            ..crate::store::FrameEvent::default()
+        };
+        change.append_frame_event(job, next, &event).await?;
+    }
+    Ok(())
+}

@@ -1,0 +1,192 @@
+//! Results of workers: refused when stale, verified before they count, committed once.
+
+use std::{collections::BTreeMap, sync::Arc, time::Instant};
+
+use splat::{
+    frame::FrameReport,
+    gaussians::{delta, validate},
+};
+use trackersplat_proto::v1::{
+    Blob, Failure, FailureKind, Report, ReportReceipt, Success, coordinator_message::Message, report::Outcome,
+};
+
+use super::{FrameBase, Hub};
+use crate::{
+    assembly,
+    blobs::BlobError,
+    failure::{StageError, failure},
+    queue::{Lease, SessionId, Stale},
+    store::{CommittedFrame, StoreError},
+};
+
+/// Longest text that a worker may send: reports hold a few numbers per view.
+const MAX_REPORT_BYTES: usize = 1 << 20;
+
+impl Hub {
+    /// A worker reports; it gets a receipt in any case.
+    pub(crate) async fn report(&self, session: SessionId, report: Report) -> Result<(), StoreError> {
+        let Report { lease_id, attempt, outcome } = report;
+        let refusal = match outcome {
+            Some(Outcome::Success(success)) => self.succeeded(session, &lease_id, attempt, success).await?,
+            Some(Outcome::Failure(reason)) => self.failed(session, &lease_id, attempt, reason).await?,
+            None => {
+                let reason = failure(FailureKind::Bug, "the worker's report has no outcome");
+                self.failed(session, &lease_id, attempt, reason).await?
+            }
+        };
+        let mut desk = self.desk.lock().await;
+        let accepted = refusal.is_none();
+        let receipt = ReportReceipt { lease_id, accepted, reason: refusal.unwrap_or_default() };
+        desk.send(session, Message::Receipt(receipt));
+        self.dispatch(&mut desk).await
+    }
+
+    /// `None` if the failure counts, else why not.
+    async fn failed(
+        &self,
+        session: SessionId,
+        lease_id: &str,
+        attempt: u32,
+        reason: Failure,
+    ) -> Result<Option<String>, StoreError> {
+        let mut desk = self.desk.lock().await;
+        match desk.queue.fail(session, lease_id, attempt, reason.kind()) {
+            Ok(failed) => {
+                self.record_failed(&mut desk, &failed, &reason).await?;
+                Ok(None)
+            }
+            Err(stale) => {
+                tracing::warn!(lease_id, attempt, %stale, "stale failure refused");
+                Ok(Some(stale.to_string()))
+            }
+        }
+    }
+
+    /// `None` if the result counts, else why not.
+    async fn succeeded(
+        &self,
+        session: SessionId,
+        lease_id: &str,
+        attempt: u32,
+        success: Success,
+    ) -> Result<Option<String>, StoreError> {
+        let held = {
+            let mut desk = self.desk.lock().await;
+            let lease = desk.queue.begin_report(session, lease_id, attempt).cloned();
+            lease.map(|lease| (desk.base(&lease.key.job), lease))
+        };
+        let (base, lease) = match held {
+            Ok(held) => held,
+            Err(stale) => return self.stale_success(lease_id, attempt, &stale).await,
+        };
+        let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
+        let verified = match base {
+            Some(base) => self.verify(&lease, base, &success).await,
+            None => Err(failure(FailureKind::Transient, "the job is not ready for results")),
+        };
+        let delta = match verified {
+            Ok(delta) => delta,
+            Err(reason) => {
+                let message = reason.message.clone();
+                let stale = self.failed(session, lease_id, attempt, reason).await?;
+                return Ok(Some(stale.unwrap_or(message)));
+            }
+        };
+        let stage_seconds: BTreeMap<String, f64> = success
+            .seconds
+            .iter()
+            .filter(|stage| stage.seconds.is_finite())
+            .map(|stage| (stage.stage.clone(), stage.seconds))
+            .collect();
+        let mut desk = self.desk.lock().await;
+        let lease = match desk.queue.commit(session, lease_id, attempt) {
+            Ok(lease) => lease,
+            Err(stale) => {
+                drop(desk);
+                return self.stale_success(lease_id, attempt, &stale).await;
+            }
+        };
+        let result = CommittedFrame {
+            delta: &delta,
+            report: &success.report_json,
+            worker: &lease.worker_id,
+            seconds,
+            stage_seconds: &stage_seconds,
+        };
+        self.record_done(&mut desk, &lease, &result).await?;
+        Ok(None)
+    }
+
+    /// A report that comes again because its receipt was lost is acknowledged; any other stale one is dropped.
+    async fn stale_success(
+        &self,
+        lease_id: &str,
+        attempt: u32,
+        stale: &Stale,
+    ) -> Result<Option<String>, StoreError> {
+        if self.store.was_committed(lease_id, attempt).await? {
+            return Ok(None);
+        }
+        tracing::warn!(lease_id, attempt, %stale, "stale result refused");
+        Ok(Some(stale.to_string()))
+    }
+
+    /// The delta exists, is what its name says, fits the static model and is finite; then the frame's file is written.
+    async fn verify(&self, lease: &Lease, base: Arc<FrameBase>, success: &Success) -> Result<Blob, Failure> {
+        let bug = |message: String| failure(FailureKind::Bug, message);
+        let delta = success.delta.clone().ok_or_else(|| bug("the worker's result names no delta".into()))?;
+        check_report(&success.report_json).map_err(bug)?;
+        let bytes = self.blobs.get(&delta).await.map_err(|error| {
+            let kind = match &error {
+                BlobError::Name(_) | BlobError::TooLarge { .. } => FailureKind::Bug,
+                BlobError::Missing(_) | BlobError::Corrupt { .. } | BlobError::Store(_) => {
+                    FailureKind::Transient
+                }
+            };
+            failure(kind, format!("the worker's delta: {error}"))
+        })?;
+        let frame = lease.key.frame;
+        self.write_frame(base, frame, bytes).await.map_err(|error| match error {
+            StageError::Failed(reason) => reason,
+            StageError::Stopped => failure(FailureKind::Transient, "the coordinator shuts down"),
+            StageError::State(error) => failure(FailureKind::Transient, error.to_string()),
+        })?;
+        Ok(delta)
+    }
+
+    /// Checks a delta against the static model and writes the frame's file into the output folder.
+    pub(crate) async fn write_frame(
+        &self,
+        base: Arc<FrameBase>,
+        frame: u32,
+        bytes: bytes::Bytes,
+    ) -> Result<(), StageError> {
+        let work = move || {
+            let bug = |message: String| StageError::new(FailureKind::Bug, message);
+            let gaussians = delta::apply(&base.model, &base.digest, &bytes).map_err(|error| {
+                bug(format!("the delta of frame {frame} does not fit the static model: {error}"))
+            })?;
+            validate::validate(&gaussians)
+                .map_err(|error| bug(format!("the Gaussians of frame {frame} are not valid: {error}")))?;
+            assembly::write_frame(&base.output, frame, &base.model, &base.blob.digest, &bytes)
+                .map_err(|error| StageError::new(FailureKind::Transient, error.to_string()))
+        };
+        let ended = tokio::task::spawn_blocking(work).await;
+        ended.unwrap_or_else(|error| {
+            Err(StageError::new(FailureKind::Bug, format!("reading the delta of frame {frame}: {error}")))
+        })
+    }
+}
+
+fn check_report(json: &str) -> Result<(), String> {
+    if json.len() > MAX_REPORT_BYTES {
+        return Err(format!(
+            "the worker's report has {} bytes, at most {MAX_REPORT_BYTES} are accepted",
+            json.len()
+        ));
+    }
+    // JSON has neither NaN nor infinity: a report with one of them is not readable.
+    serde_json::from_str::<FrameReport>(json)
+        .map(|_| ())
+        .map_err(|error| format!("the worker's report is not readable: {error}"))
+}

@@ -1,0 +1,210 @@
+//! Workers come and go.
+
+use std::{sync::Arc, time::Instant};
+
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+use tonic::Status;
+use trackersplat_proto::v1::{
+    CancelLease, CoordinatorMessage, Heartbeat, Lease as LeaseMessage, Progress, Register,
+    coordinator_message::Message, job_event::Event,
+};
+
+use super::{Desk, Hub, Notice};
+use crate::{
+    failure::failure,
+    queue::{FailedLease, Lease, SessionId, frame::FrameState},
+    store::{AttemptOutcome, FrameEvent, StoreError},
+};
+
+/// Messages that may wait for one worker. A worker gets a few per frame; a full queue is a dead connection.
+pub(crate) const OUTGOING_QUEUE: usize = 32;
+
+/// One worker's stream, as the desk sees it.
+pub(super) struct Session {
+    worker_id: String,
+    outgoing: mpsc::Sender<Result<CoordinatorMessage, Status>>,
+    /// Cancelled when the stream is to be closed from this side.
+    close: CancellationToken,
+}
+
+/// One worker's stream, as its service sees it.
+pub(crate) struct Registered {
+    pub(crate) session: SessionId,
+    /// Cancelled when the stream is to be closed from this side.
+    pub(crate) close: CancellationToken,
+}
+
+impl Desk {
+    /// Sends to a worker without waiting; a stream that takes no more is closed.
+    pub(super) fn send(&mut self, session: SessionId, message: Message) {
+        let Some(session) = self.sessions.get(&session) else { return };
+        if session.outgoing.try_send(Ok(CoordinatorMessage { message: Some(message) })).is_err() {
+            tracing::warn!(worker_id = session.worker_id, "the worker reads nothing; closing its stream");
+            session.close.cancel();
+        }
+    }
+}
+
+impl Hub {
+    /// A worker's stream opens. Older streams of the same worker are closed, their leases lost.
+    pub(crate) async fn register(
+        &self,
+        worker: &Register,
+        outgoing: mpsc::Sender<Result<CoordinatorMessage, Status>>,
+    ) -> Result<Registered, StoreError> {
+        let mut desk = self.desk.lock().await;
+        let session = SessionId(desk.next_session);
+        desk.next_session += 1;
+        let close = self.shutdown.child_token();
+        let mut change = self.store.change().await?;
+        change.worker_connected(worker).await?;
+        change.commit().await?;
+        for older in desk.queue.connect(session, &worker.worker_id) {
+            self.lose(&mut desk, older, "the worker registered again").await?;
+        }
+        let entry = Session { worker_id: worker.worker_id.clone(), outgoing, close: close.clone() };
+        desk.sessions.insert(session, entry);
+        tracing::info!(worker_id = worker.worker_id, device = worker.device, "worker connected");
+        self.tell_workers(&mut desk);
+        Ok(Registered { session, close })
+    }
+
+    /// A worker's stream is gone. At shutdown this is the coordinator's own doing: the lease is void after the restart
+    /// and does not count as failed.
+    pub(crate) async fn disconnected(&self, session: SessionId) -> Result<(), StoreError> {
+        let mut desk = self.desk.lock().await;
+        if self.shutdown.is_cancelled() || !desk.sessions.contains_key(&session) {
+            return Ok(());
+        }
+        self.lose(&mut desk, session, "the connection to the worker broke").await?;
+        self.dispatch(&mut desk).await
+    }
+
+    async fn lose(&self, desk: &mut Desk, session: SessionId, reason: &str) -> Result<(), StoreError> {
+        let worker_id = self.forget(desk, session).await?;
+        tracing::info!(worker_id, reason, "worker gone");
+        if let Some(failed) = desk.queue.disconnect(session) {
+            let message = format!("{reason} (worker {worker_id})");
+            let lost = failure(trackersplat_proto::v1::FailureKind::LostWorker, message);
+            self.record_failed(desk, &failed, &lost).await?;
+        }
+        Ok(())
+    }
+
+    /// A worker drains: its lease goes back without counting as failed.
+    pub(crate) async fn going_away(&self, session: SessionId, reason: &str) -> Result<(), StoreError> {
+        let mut desk = self.desk.lock().await;
+        let given_back = desk.queue.drain(session);
+        let worker_id = self.forget(&mut desk, session).await?;
+        tracing::info!(worker_id, reason, "worker drains");
+        if let Some(lease) = given_back {
+            let (job, frame) = (&lease.key.job, lease.key.frame);
+            let mut change = self.store.change().await?;
+            change.end_attempt(&lease.id, AttemptOutcome::Released(reason)).await?;
+            change.release_frame(job, frame, lease.attempt, &worker_id).await?;
+            change.commit().await?;
+            self.tell_stored(job);
+        }
+        self.dispatch(&mut desk).await
+    }
+
+    async fn forget(&self, desk: &mut Desk, session: SessionId) -> Result<String, StoreError> {
+        let Some(entry) = desk.sessions.remove(&session) else { return Ok(String::new()) };
+        entry.close.cancel();
+        let is_back = desk.sessions.values().any(|other| other.worker_id == entry.worker_id);
+        if !is_back {
+            let mut change = self.store.change().await?;
+            change.worker_gone(&entry.worker_id).await?;
+            change.commit().await?;
+        }
+        Ok(entry.worker_id)
+    }
+
+    /// A worker asks for a frame.
+    pub(crate) async fn lease_requested(&self, session: SessionId) -> Result<(), StoreError> {
+        let mut desk = self.desk.lock().await;
+        desk.queue.park(session);
+        self.dismiss_if_idle(&mut desk);
+        self.dispatch(&mut desk).await
+    }
+
+    /// A sign of life. A worker that works on a lease it no longer holds is told to stop.
+    pub(crate) async fn heartbeat(&self, session: SessionId, heartbeat: Heartbeat) {
+        let Heartbeat { lease_id, attempt, stage, done, total } = heartbeat;
+        if lease_id.is_empty() {
+            return;
+        }
+        let mut desk = self.desk.lock().await;
+        match desk.queue.heartbeat(session, &lease_id, attempt, Instant::now()) {
+            Ok(lease) => {
+                let progress = Progress {
+                    stage,
+                    frame: lease.key.frame,
+                    done,
+                    total,
+                    worker_id: lease.worker_id.clone(),
+                };
+                self.tell(Notice::Transient(lease.key.job.clone(), Event::Progress(progress)));
+            }
+            Err(stale) => {
+                let reason = stale.to_string();
+                desk.send(session, Message::CancelLease(CancelLease { lease_id, reason }));
+            }
+        }
+    }
+
+    /// Leases without a sign of life expire.
+    pub(crate) async fn tick(&self, now: Instant) -> Result<(), StoreError> {
+        let mut desk = self.desk.lock().await;
+        for failed in desk.queue.expire(now) {
+            let FailedLease { lease, .. } = &failed;
+            let silence = self.options.lease_duration;
+            let message = format!("no heartbeat of worker {} for {silence:?}", lease.worker_id);
+            let lost = failure(trackersplat_proto::v1::FailureKind::LostWorker, message);
+            let reason = "the lease has expired".to_owned();
+            desk.send(
+                lease.session,
+                Message::CancelLease(CancelLease { lease_id: lease.id.clone(), reason }),
+            );
+            self.record_failed(&mut desk, &failed, &lost).await?;
+        }
+        if self.options.dismiss_workers_when_idle {
+            self.give_up_beyond_all_workers(&mut desk).await?;
+        }
+        self.dispatch(&mut desk).await
+    }
+
+    /// Gives ready frames to waiting workers: granted on disk before the worker hears of it.
+    pub(super) async fn dispatch(&self, desk: &mut Desk) -> Result<(), StoreError> {
+        let new_lease_id = || uuid::Uuid::now_v7().simple().to_string();
+        for lease in desk.queue.assign(Instant::now(), new_lease_id) {
+            self.grant(desk, lease).await?;
+        }
+        self.tell_workers(desk);
+        Ok(())
+    }
+
+    async fn grant(&self, desk: &mut Desk, lease: Lease) -> Result<(), StoreError> {
+        let Lease { id, attempt, key, worker_id, session, .. } = &lease;
+        let mut change = self.store.change().await?;
+        change.grant(&lease).await?;
+        let event =
+            FrameEvent { frame: key.frame, attempt: *attempt, worker: worker_id, ..FrameEvent::default() };
+        change.append_frame_event(&key.job, FrameState::Leased, &event).await?;
+        change.commit().await?;
+        self.tell_stored(&key.job);
+        let record = self.store.frame(&key.job, key.frame).await?;
+        let job = record.ok_or_else(|| StoreError::Value {
+            place: "frames",
+            value: format!("no row for frame {} of job {}", key.frame, key.job),
+        })?;
+        tracing::info!(job_id = %key.job, frame = key.frame, attempt, worker_id, lease_id = id, "frame leased");
+        let message = LeaseMessage { lease_id: id.clone(), attempt: *attempt, job: Some(job.request()?) };
+        desk.send(*session, Message::Lease(message));
+        Ok(())
+    }
+}
+
+/// Shared by the services.
+pub(crate) type SharedHub = Arc<Hub>;

@@ -1,0 +1,246 @@
+use super::*;
+
+const LEASE: Duration = Duration::from_secs(10);
+
+/// A queue with its own clock and lease names, so that no test sleeps.
+struct Bench {
+    queue: Queue,
+    now: Instant,
+    leases: u32,
+}
+
+impl Bench {
+    fn new(frames: impl IntoIterator<Item = u32>) -> Self {
+        let mut queue = Queue::new(QueuePolicy { max_attempts: 3, lease_duration: LEASE });
+        for frame in frames {
+            queue.add(key(frame), FrameHistory::default());
+        }
+        Self { queue, now: Instant::now(), leases: 0 }
+    }
+
+    fn connect(&mut self, session: u64, worker: &str) -> SessionId {
+        let session = SessionId(session);
+        self.queue.connect(session, worker);
+        self.queue.park(session);
+        session
+    }
+
+    fn assign(&mut self) -> Vec<Lease> {
+        let leases = &mut self.leases;
+        self.queue.assign(self.now, || {
+            *leases += 1;
+            format!("lease-{leases}")
+        })
+    }
+
+    fn assign_one(&mut self) -> Lease {
+        let mut leases = self.assign();
+        assert_eq!(leases.len(), 1, "{leases:?}");
+        leases.remove(0)
+    }
+
+    fn fail(&mut self, lease: &Lease, kind: FailureKind) -> FailedLease {
+        let failed =
+            self.queue.fail(lease.session, &lease.id, lease.attempt, kind).expect("the lease is held");
+        self.queue.park(lease.session);
+        failed
+    }
+}
+
+fn key(frame: u32) -> FrameKey {
+    FrameKey { job: "job".into(), frame }
+}
+
+#[test]
+fn frames_go_out_in_order_to_the_worker_that_asked_first() {
+    let mut bench = Bench::new([3, 1, 2]);
+    let late = SessionId(1);
+    bench.queue.connect(late, "late");
+    bench.connect(2, "early");
+    bench.queue.park(late);
+    let leases = bench.assign();
+    let given: Vec<_> = leases.iter().map(|lease| (lease.worker_id.as_str(), lease.key.frame)).collect();
+    assert_eq!(given, [("early", 1), ("late", 2)]);
+    assert_eq!(bench.assign(), [], "both are busy");
+}
+
+#[test]
+fn an_earlier_job_goes_first() {
+    let mut bench = Bench::new([]);
+    bench.queue.add(FrameKey { job: "b".into(), frame: 1 }, FrameHistory::default());
+    bench.queue.add(FrameKey { job: "a".into(), frame: 9 }, FrameHistory::default());
+    bench.connect(1, "w");
+    assert_eq!(&*bench.assign_one().key.job, "a");
+}
+
+#[test]
+fn a_worker_holds_one_lease_however_often_it_asks() {
+    let mut bench = Bench::new([1, 2]);
+    let session = bench.connect(1, "w");
+    bench.assign_one();
+    bench.queue.park(session);
+    assert_eq!(bench.assign(), []);
+}
+
+#[test]
+fn a_committed_frame_is_closed_and_its_lease_dead() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    assert_eq!(bench.queue.commit(session, &lease.id, 1).expect("held").key, key(1));
+    assert_eq!(bench.queue.open_frames("job"), 0);
+    assert_eq!(bench.queue.commit(session, &lease.id, 1), Err(Stale::NotHeld(lease.id)));
+}
+
+#[test]
+fn stale_messages_are_told_apart() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let other = bench.connect(2, "v");
+    let lease = bench.assign_one();
+    let wrong_attempt = Stale::OtherAttempt { lease_id: lease.id.clone(), held: 1, given: 2 };
+    assert_eq!(bench.queue.heartbeat(session, &lease.id, 2, bench.now), Err(wrong_attempt.clone()));
+    assert_eq!(bench.queue.begin_report(session, &lease.id, 2), Err(wrong_attempt.clone()));
+    assert_eq!(bench.queue.commit(session, &lease.id, 2), Err(wrong_attempt.clone()));
+    assert_eq!(bench.queue.fail(session, &lease.id, 2, FailureKind::Bug), Err(wrong_attempt));
+    let stolen = Stale::OtherWorker(lease.id.clone());
+    assert_eq!(bench.queue.commit(other, &lease.id, 1), Err(stolen));
+    assert_eq!(bench.queue.commit(session, "lease-9", 1), Err(Stale::NotHeld("lease-9".into())));
+    assert!(bench.queue.commit(session, &lease.id, 1).is_ok(), "none of them harmed the lease");
+}
+
+#[test]
+fn a_silent_lease_expires_at_its_deadline_and_a_heartbeat_moves_it() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    let start = bench.now;
+    let almost = LEASE - Duration::from_millis(1);
+    assert_eq!(bench.queue.expire(start + almost), []);
+    assert!(bench.queue.heartbeat(session, &lease.id, 1, start + almost).is_ok());
+    assert_eq!(bench.queue.expire(start + LEASE), []);
+    let expired = bench.queue.expire(start + almost + LEASE);
+    assert!(expired.len() == 1 && expired[0].retried && expired[0].lease.id == lease.id);
+    let late = bench.queue.commit(session, &lease.id, 1);
+    assert_eq!(late, Err(Stale::NotHeld(lease.id)), "its report is refused");
+}
+
+#[test]
+fn a_lease_does_not_expire_while_its_result_is_verified() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    bench.queue.begin_report(session, &lease.id, 1).expect("held");
+    assert_eq!(bench.queue.expire(bench.now + 10 * LEASE), []);
+    assert!(bench.queue.commit(session, &lease.id, 1).is_ok());
+}
+
+#[test]
+fn a_frame_fails_for_good_after_three_failed_attempts() {
+    let mut bench = Bench::new([1]);
+    bench.connect(1, "w");
+    for (attempt, retried) in [(1, true), (2, true), (3, false)] {
+        let lease = bench.assign_one();
+        assert_eq!(lease.attempt, attempt);
+        assert_eq!(bench.fail(&lease, FailureKind::Transient).retried, retried);
+    }
+    assert_eq!(bench.queue.open_frames("job"), 0);
+    assert_eq!(bench.assign(), []);
+}
+
+#[test]
+fn bad_input_is_not_tried_again() {
+    let mut bench = Bench::new([1]);
+    bench.connect(1, "w");
+    let lease = bench.assign_one();
+    assert!(!bench.fail(&lease, FailureKind::BadInput).retried);
+    assert_eq!(bench.queue.open_frames("job"), 0);
+}
+
+#[test]
+fn out_of_resources_waits_for_another_worker() {
+    let mut bench = Bench::new([1]);
+    bench.connect(1, "small");
+    let lease = bench.assign_one();
+    assert!(bench.fail(&lease, FailureKind::OutOfResources).retried);
+    assert_eq!(bench.assign(), [], "the same worker does not get it again");
+    assert_eq!(bench.queue.waiting_frames("job"), 1);
+    assert_eq!(bench.queue.frames_beyond_all_workers(), [key(1)]);
+    bench.connect(2, "large");
+    assert_eq!(bench.queue.frames_beyond_all_workers(), []);
+    assert_eq!(bench.assign_one().worker_id, "large");
+}
+
+#[test]
+fn a_lost_frame_prefers_another_worker_and_takes_the_same_if_it_is_alone() {
+    let mut bench = Bench::new([1]);
+    let lost = bench.connect(1, "a");
+    bench.assign_one();
+    assert!(bench.queue.disconnect(lost).expect("a lease").retried);
+    bench.connect(2, "a");
+    bench.queue.connect(SessionId(3), "b");
+    assert_eq!(bench.assign(), [], "b is connected and will ask");
+    assert_eq!(bench.queue.disconnect(SessionId(3)), None);
+    let lease = bench.assign_one();
+    assert_eq!((lease.worker_id.as_str(), lease.attempt), ("a", 2));
+}
+
+#[test]
+fn a_draining_worker_gives_its_frame_back_without_a_failure() {
+    let mut bench = Bench::new([1]);
+    for attempt in 1..=5 {
+        let session = bench.connect(attempt.into(), "w");
+        assert_eq!(bench.assign_one().attempt, attempt);
+        let given_back = bench.queue.drain(session).expect("a lease");
+        assert_eq!(given_back.attempt, attempt, "attempts count up, so that stale reports are told apart");
+    }
+    assert_eq!((bench.queue.open_frames("job"), bench.queue.connected()), (1, 0));
+}
+
+#[test]
+fn a_cancelled_job_loses_its_leases_and_frames_and_no_other() {
+    let mut bench = Bench::new([1, 2]);
+    bench.queue.add(FrameKey { job: "other".into(), frame: 1 }, FrameHistory::default());
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    let cancelled = bench.queue.cancel_job("job");
+    assert_eq!(cancelled, [lease.clone()]);
+    assert_eq!(bench.queue.cancel_job("job"), []);
+    assert_eq!((bench.queue.open_frames("job"), bench.queue.open_frames("other")), (0, 1));
+    assert!(bench.queue.commit(session, &lease.id, 1).is_err());
+    bench.queue.park(session);
+    assert_eq!(&*bench.assign_one().key.job, "other");
+}
+
+#[test]
+fn a_worker_that_registers_again_replaces_its_older_stream() {
+    let mut bench = Bench::new([1]);
+    let old = bench.connect(1, "w");
+    bench.assign_one();
+    assert_eq!(bench.queue.connect(SessionId(2), "w"), [old]);
+    assert!(bench.queue.disconnect(old).expect("its lease").retried);
+    assert_eq!(bench.queue.connected(), 1);
+}
+
+#[test]
+fn attempts_go_on_from_the_history() {
+    let mut bench = Bench::new([]);
+    let excluded = BTreeSet::from(["small".to_owned()]);
+    bench.queue.add(key(1), FrameHistory { attempts: 4, failures: 2, excluded });
+    bench.connect(1, "small");
+    assert_eq!(bench.assign(), []);
+    bench.connect(2, "w");
+    let lease = bench.assign_one();
+    assert_eq!(lease.attempt, 5);
+    assert!(!bench.fail(&lease, FailureKind::Bug).retried, "its third failure");
+}
+
+#[test]
+fn with_no_worker_every_ready_frame_waits() {
+    let mut bench = Bench::new([1, 2, 3]);
+    assert_eq!((bench.queue.connected(), bench.queue.waiting_frames("job")), (0, 3));
+    assert_eq!(bench.queue.frames_beyond_all_workers(), [], "a worker may still join");
+    bench.connect(1, "w");
+    assert_eq!(bench.queue.waiting_frames("job"), 0);
+    assert!(bench.queue.close_ready(&key(3)) && !bench.queue.close_ready(&key(3)));
+}

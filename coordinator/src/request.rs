@@ -1,0 +1,111 @@
+//! What a submission asks for, as it is stored.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use splat::{clip::ClipOptions, settings::Settings};
+
+use crate::keys::digest_of;
+
+/// Decoded images that a clip may keep in memory.
+const CLIP_CACHE_BYTES: u64 = 256 << 20;
+
+/// A file that the job reads.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct InputFile {
+    pub(crate) path: String,
+    pub(crate) digest: String,
+}
+
+impl InputFile {
+    /// File name without its ending.
+    pub(crate) fn stem(&self) -> &str {
+        Path::new(&self.path).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default()
+    }
+}
+
+/// Where the tracks come from.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum TrackSource {
+    #[default]
+    Own,
+    Exact,
+    Files(Vec<InputFile>),
+}
+
+/// What a submission asks for besides clip, output and settings.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct JobRequest {
+    /// First and last frame; `None`: all.
+    pub(crate) frames: Option<(u32, u32)>,
+    /// Empty: those that the data set names.
+    pub(crate) test_views: Vec<String>,
+    /// `None`: reconstruct it.
+    pub(crate) static_model: Option<InputFile>,
+    pub(crate) tracks: TrackSource,
+    /// Whether every track file is named after a training view.
+    pub(crate) track_files_by_name: bool,
+    /// Positions of the training views in the clip.
+    pub(crate) training_positions: Vec<usize>,
+}
+
+impl JobRequest {
+    /// `scratch` is the folder for frames that are decoded from videos.
+    pub(crate) fn clip_options(&self, scratch: PathBuf) -> ClipOptions {
+        ClipOptions {
+            test_views: self.test_views.clone(),
+            frames: self.frames,
+            cache_bytes: CLIP_CACHE_BYTES,
+            scratch: Some(scratch),
+        }
+    }
+
+    /// Digest of everything that, with the clip, decides the results. Files count by content, not by name.
+    pub(crate) fn settings_digest(&self, settings: &Settings) -> String {
+        let mut request = self.clone();
+        let nameless = |file: &mut InputFile| file.path.clear();
+        request.static_model.iter_mut().for_each(nameless);
+        if let TrackSource::Files(files) = &mut request.tracks {
+            let by_name = self.track_files_by_name;
+            files
+                .iter_mut()
+                .for_each(|file| file.path = if by_name { file.stem().to_owned() } else { String::new() });
+            if by_name {
+                files.sort_by(|a, b| a.path.cmp(&b.path));
+            }
+        }
+        digest_of(&(settings, request))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_digest_knows_content_and_not_paths() {
+        let settings = Settings::default();
+        let file = |path: &str, digest: &str| InputFile { path: path.into(), digest: digest.into() };
+        let request = JobRequest { static_model: Some(file("/a/s.ply", "1")), ..JobRequest::default() };
+        let moved = JobRequest { static_model: Some(file("/b/t.ply", "1")), ..JobRequest::default() };
+        let other = JobRequest { static_model: Some(file("/a/s.ply", "2")), ..JobRequest::default() };
+        assert_eq!(request.settings_digest(&settings), moved.settings_digest(&settings));
+        assert_ne!(request.settings_digest(&settings), other.settings_digest(&settings));
+        let seeded = Settings { seed: 1, ..settings.clone() };
+        assert_ne!(request.settings_digest(&settings), request.settings_digest(&seeded));
+        let some_frames = JobRequest { frames: Some((1, 2)), ..request.clone() };
+        assert_ne!(request.settings_digest(&settings), some_frames.settings_digest(&settings));
+
+        let named = |files: Vec<InputFile>| JobRequest {
+            tracks: TrackSource::Files(files),
+            track_files_by_name: true,
+            ..JobRequest::default()
+        };
+        let forward = named(vec![file("/a/cam00.npz", "1"), file("/a/cam01.npz", "2")]);
+        let backward = named(vec![file("/b/cam01.npz", "2"), file("/b/cam00.npz", "1")]);
+        assert_eq!(forward.settings_digest(&settings), backward.settings_digest(&settings));
+        let swapped = named(vec![file("/a/cam00.npz", "2"), file("/a/cam01.npz", "1")]);
+        assert_ne!(forward.settings_digest(&settings), swapped.settings_digest(&settings));
+    }
+}

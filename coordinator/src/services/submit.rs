@@ -1,0 +1,273 @@
+//! Submission: everything that can be refused is refused before anything is touched.
+
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+use splat::{
+    clip::{Clip, Split},
+    settings::Settings,
+};
+use tonic::Status;
+use trackersplat_proto::v1::{SubmitRequest, SubmitResponse, submit_request::Tracks};
+
+use super::state_failed;
+use crate::{
+    assembly::SEQUENCE,
+    hub::{Hub, SharedHub},
+    keys::VERSION,
+    output::{self, Marker, OutputError},
+    queue::job::JobState,
+    request::{InputFile, JobRequest, TrackSource},
+    store::{JobRecord, NewJob},
+};
+
+/// A submission that was read and found possible.
+struct Submission {
+    clip_path: PathBuf,
+    clip: Arc<Clip>,
+    clip_digest: String,
+    settings: Settings,
+    settings_digest: String,
+    request: JobRequest,
+    /// Empty: the coordinator chooses.
+    output_request: String,
+}
+
+pub(super) async fn submit(hub: &SharedHub, request: SubmitRequest) -> Result<SubmitResponse, Status> {
+    if hub.shutdown.is_cancelled() {
+        return Err(Status::unavailable("the coordinator shuts down; submit again when it is back"));
+    }
+    let _one_at_a_time = hub.submitting.lock().await;
+    let scratch = hub.scratch_folder();
+    let reading = tokio::task::spawn_blocking(move || read(request, scratch)).await;
+    let submission =
+        reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))??;
+    let known = hub
+        .store
+        .same_job(&submission.clip_digest, &submission.settings_digest, &submission.output_request)
+        .await
+        .map_err(|error| state_failed(hub, error))?;
+    match known {
+        Some(job) => resume(hub, job, submission).await,
+        None => begin(hub, submission).await,
+    }
+}
+
+async fn resume(hub: &SharedHub, job: JobRecord, submission: Submission) -> Result<SubmitResponse, Status> {
+    let state = job.state().map_err(|error| state_failed(hub, error))?;
+    let output = PathBuf::from(&job.output);
+    let response = SubmitResponse { job_id: job.id.clone(), resumed: true };
+    // A finished job whose outputs were removed puts them together again.
+    let is_complete = state == JobState::Done && output.join(SEQUENCE).exists();
+    if is_complete || !state.has_ended() {
+        return Ok(response);
+    }
+    claim(hub, &output, &submission, &job.id).await?;
+    let resumed = hub.resubmit_job(&job.id, submission.clip).await;
+    resumed.map_err(|error| state_failed(hub, error))?;
+    Ok(response)
+}
+
+async fn begin(hub: &SharedHub, submission: Submission) -> Result<SubmitResponse, Status> {
+    let id = uuid::Uuid::now_v7().simple().to_string();
+    let output = match submission.output_request.as_str() {
+        "" => hub.options.root.join("jobs").join(&id),
+        chosen => PathBuf::from(chosen),
+    };
+    claim(hub, &output, &submission, &id).await?;
+    let json = |what: &str, value: serde_json::Result<String>| {
+        value.map_err(|error| Status::internal(format!("{what} as JSON: {error}")))
+    };
+    let job = NewJob {
+        id: id.clone(),
+        clip: submission.clip_path.display().to_string(),
+        clip_digest: submission.clip_digest,
+        output: output.display().to_string(),
+        output_request: submission.output_request,
+        settings: json("the settings", serde_json::to_string(&submission.settings))?,
+        settings_digest: submission.settings_digest,
+        request: json("the request", serde_json::to_string(&submission.request))?,
+        frame_numbers: json("the frame numbers", serde_json::to_string(submission.clip.frames()))?,
+    };
+    hub.create_job(&job, submission.clip).await.map_err(|error| state_failed(hub, error))?;
+    Ok(SubmitResponse { job_id: id, resumed: false })
+}
+
+/// Makes sure that the output folder is this job's, and marks it.
+async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) -> Result<(), Status> {
+    let marker = Marker {
+        job_id: job_id.to_owned(),
+        clip: submission.clip_path.display().to_string(),
+        clip_digest: submission.clip_digest.clone(),
+        settings_digest: submission.settings_digest.clone(),
+        version: VERSION.to_owned(),
+    };
+    let active = hub.active_outputs().await.map_err(|error| state_failed(hub, error))?;
+    let refused = |error: OutputError| Status::failed_precondition(error.to_string());
+    output::check_owner(output, &marker).map_err(refused)?;
+    if let Some((other, _)) = active.iter().find(|(other, folder)| folder == output && other != job_id) {
+        return Err(Status::failed_precondition(format!(
+            "job {other} is writing to the output folder {}; wait for it, cancel it, or give another folder",
+            output.display()
+        )));
+    }
+    output::claim(output, &marker).map_err(refused)
+}
+
+fn read(request: SubmitRequest, scratch: PathBuf) -> Result<Submission, Status> {
+    let settings = read_settings(&request.settings_json)?;
+    let clip_path = local_path("clip", &request.clip)?;
+    let mut job_request = JobRequest {
+        frames: read_frames(request.first_frame, request.last_frame)?,
+        test_views: request.test_views,
+        static_model: match request.static_model.as_str() {
+            "" => None,
+            path => Some(input_file("static model", path)?),
+        },
+        tracks: read_tracks(request.tracks)?,
+        ..JobRequest::default()
+    };
+    let options = job_request.clip_options(scratch);
+    let bad_clip = |error: splat::clip::ClipError| Status::invalid_argument(error.to_string());
+    let clip = Clip::open(&clip_path, &options).map_err(bad_clip)?;
+    if clip.frames().is_empty() {
+        return Err(Status::invalid_argument(format!("the clip {} has no such frames", clip_path.display())));
+    }
+    let training = clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train);
+    let (positions, names): (Vec<usize>, Vec<&str>) =
+        training.map(|(position, view)| (position, view.name.as_str())).unzip();
+    if let TrackSource::Files(files) = &job_request.tracks {
+        job_request.track_files_by_name = files.iter().all(|file| names.contains(&file.stem()));
+    }
+    job_request.training_positions = positions;
+    let clip_digest = clip.digest().map_err(bad_clip)?;
+    let output_request = match request.output.as_str() {
+        "" => String::new(),
+        output => local_path("output", output)?.display().to_string(),
+    };
+    let settings_digest = job_request.settings_digest(&settings);
+    let clip = Arc::new(clip);
+    Ok(Submission {
+        clip_path,
+        clip,
+        clip_digest,
+        settings,
+        settings_digest,
+        request: job_request,
+        output_request,
+    })
+}
+
+/// Empty: the defaults. An unknown key is refused by name.
+fn read_settings(json: &str) -> Result<Settings, Status> {
+    if json.is_empty() {
+        return Ok(Settings::default());
+    }
+    serde_json::from_str(json).map_err(|error| Status::invalid_argument(format!("settings_json: {error}")))
+}
+
+fn read_frames(first: u32, last: u32) -> Result<Option<(u32, u32)>, Status> {
+    match (first, last) {
+        (0, 0) => Ok(None),
+        (first, last) if first <= last => Ok(Some((first, last))),
+        (first, last) => Err(Status::invalid_argument(format!(
+            "frames {first} to {last}: the first comes after the last; swap them, or give 0 and 0 for all"
+        ))),
+    }
+}
+
+fn read_tracks(tracks: Option<Tracks>) -> Result<TrackSource, Status> {
+    match tracks {
+        None => Ok(TrackSource::Own),
+        Some(Tracks::ExactTracks(_)) => Ok(TrackSource::Exact),
+        Some(Tracks::TrackFiles(files)) if files.paths.is_empty() => {
+            Err(Status::invalid_argument("track_files names no file; give one npz per training view"))
+        }
+        Some(Tracks::TrackFiles(files)) => {
+            let files: Result<_, _> = files.paths.iter().map(|path| input_file("tracks", path)).collect();
+            files.map(TrackSource::Files)
+        }
+    }
+}
+
+fn input_file(what: &str, path: &str) -> Result<InputFile, Status> {
+    let path = local_path(what, path)?;
+    let mut hasher = blake3::Hasher::new();
+    let read = std::fs::File::open(&path).and_then(|file| hasher.update_reader(file).map(|_| ()));
+    read.map_err(|error| {
+        Status::invalid_argument(format!(
+            "{what} {}: {error}; check that the file is there and may be read",
+            path.display()
+        ))
+    })?;
+    Ok(InputFile { path: path.display().to_string(), digest: hasher.finalize().to_hex().to_string() })
+}
+
+/// An absolute path from a path or a `file://` URL.
+fn local_path(what: &str, given: &str) -> Result<PathBuf, Status> {
+    let wrong = |reason: &str| {
+        Status::invalid_argument(format!(
+            "{what} '{given}' {reason}; give a path on the coordinator's machine or a file:// URL"
+        ))
+    };
+    let path = match given.split_once("://") {
+        Some(("file", path)) => percent_decoded(path).ok_or_else(|| wrong("is no valid URL"))?,
+        Some(_) => return Err(wrong("is of a kind that is not supported")),
+        None => given.to_owned(),
+    };
+    if path.is_empty() {
+        return Err(wrong("is empty"));
+    }
+    std::path::absolute(&path).map_err(|error| wrong(&error.to_string()))
+}
+
+/// `%20` and the like as the bytes they stand for.
+fn percent_decoded(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let Some((&first, tail)) = rest.split_first() {
+        rest = tail;
+        if first != b'%' {
+            bytes.push(first);
+            continue;
+        }
+        let digits = tail.get(..2)?;
+        bytes.push(u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?);
+        rest = &tail[2..];
+    }
+    String::from_utf8(bytes).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn paths_and_file_urls_are_absolute_local_paths() {
+        assert_eq!(local_path("clip", "file:///a%20b/c").unwrap(), Path::new("/a b/c"));
+        assert_eq!(local_path("clip", "/a b/c").unwrap(), Path::new("/a b/c"));
+        assert!(local_path("clip", "relative").unwrap().is_absolute());
+        for wrong in ["", "s3://bucket/clip", "file:///a%2", "file:///a%zz", "file://"] {
+            let status = local_path("clip", wrong).unwrap_err();
+            assert_eq!(status.code(), tonic::Code::InvalidArgument, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn an_unknown_setting_is_named() {
+        assert_eq!(read_settings("").unwrap(), Settings::default());
+        let status = read_settings(r#"{"sede": 1}"#).unwrap_err();
+        assert!(status.message().contains("sede") && status.message().contains("settings_json"), "{status}");
+    }
+
+    #[test]
+    fn a_range_of_frames_runs_forwards() {
+        assert_eq!(read_frames(0, 0).unwrap(), None);
+        assert_eq!(read_frames(2, 2).unwrap(), Some((2, 2)));
+        assert!(read_frames(3, 2).is_err());
+    }
+}

@@ -1,0 +1,7 @@
+//! The coordinator over loopback, with workers that speak the protocol by hand.
+
+mod harness;
+mod jobs;
+mod leases;
+mod restart;
+mod transfers;
