@@ -159,7 +159,8 @@ pub fn write_frame(
 ) -> Result<(), AssemblyError> {
     let failed = |reason| AssemblyError::Frame { frame: number, reason };
     let digest = blake3::Hash::from_hex(static_digest).map_err(|error| failed(error.to_string()))?;
-    let frame = delta::apply(static_model, digest.as_bytes(), delta).map_err(|error| failed(error.to_string()))?;
+    let frame =
+        delta::apply(static_model, digest.as_bytes(), delta).map_err(|error| failed(error.to_string()))?;
     write_atomically(&output.join(delta_path(number)), delta)?;
     write_atomically(&output.join(frame_path(number)), &ply::write_ply(&frame))
 }
