@@ -159,7 +159,8 @@ fn absolute(path: &str) -> Result<String, CliError> {
     if path.contains("://") {
         return Ok(path.to_owned());
     }
-    let absolute = std::path::absolute(path).map_err(|error| CliError::bad_input(format!("path '{path}'"), error))?;
+    let absolute =
+        std::path::absolute(path).map_err(|error| CliError::bad_input(format!("path '{path}'"), error))?;
     Ok(absolute.to_string_lossy().into_owned())
 }
 
@@ -187,14 +188,27 @@ mod tests {
         assert!(Path::new(&request.clip).is_absolute() && request.clip.ends_with("/clip"));
         assert_eq!((request.first_frame, request.last_frame), (0, 0));
         assert_eq!(request.tracks, None);
-        assert!(request.output.is_empty() && request.static_model.is_empty() && request.test_views.is_empty());
+        assert!(
+            request.output.is_empty() && request.static_model.is_empty() && request.test_views.is_empty()
+        );
     }
 
     #[test]
     fn every_flag_reaches_the_submission() {
         let line = [
-            "file:///clip", "--frames", "2..5", "--test-views", "a,b", "--static-model", "/m.ply", "--tracks", "exact",
-            "--seed", "9", "--motion", "none",
+            "file:///clip",
+            "--frames",
+            "2..5",
+            "--test-views",
+            "a,b",
+            "--static-model",
+            "/m.ply",
+            "--tracks",
+            "exact",
+            "--seed",
+            "9",
+            "--motion",
+            "none",
         ];
         let request = request(&line).unwrap();
         assert_eq!(request.clip, "file:///clip");
@@ -208,7 +222,9 @@ mod tests {
 
     #[test]
     fn track_files_are_absolute_and_exact_stands_alone() {
-        let Some(Tracks::TrackFiles(files)) = request(&["clip", "--tracks", "a.npz", "/b.npz"]).unwrap().tracks else {
+        let Some(Tracks::TrackFiles(files)) =
+            request(&["clip", "--tracks", "a.npz", "/b.npz"]).unwrap().tracks
+        else {
             panic!("track files");
         };
         assert!(files.paths[0].ends_with("/a.npz") && Path::new(&files.paths[0]).is_absolute());

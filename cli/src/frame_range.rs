@@ -25,7 +25,9 @@ impl FromStr for FrameRange {
             return Err("frames count from 1; write 1..10 or 7".to_owned());
         }
         if last < first {
-            return Err(format!("the range ends at {last}, before it begins at {first}; write {last}..{first}"));
+            return Err(format!(
+                "the range ends at {last}, before it begins at {first}; write {last}..{first}"
+            ));
         }
         Ok(Self { first, last })
     }

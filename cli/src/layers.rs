@@ -94,7 +94,8 @@ impl Layered {
     fn find(&mut self, path: &[String]) -> Result<&mut Value, String> {
         let mut place = &mut self.tree;
         for (depth, key) in path.iter().enumerate() {
-            let section = if depth == 0 { "the settings".to_owned() } else { format!("'{}'", path[..depth].join(".")) };
+            let section =
+                if depth == 0 { "the settings".to_owned() } else { format!("'{}'", path[..depth].join(".")) };
             let known = keys(place);
             place = place
                 .as_object_mut()
@@ -114,7 +115,8 @@ fn keys(value: &Value) -> String {
 fn parse_value(text: &str) -> Value {
     let document = format!("value = {text}");
     let parsed = toml::from_str::<toml::Table>(&document).ok().filter(|table| table.len() == 1);
-    let value = parsed.and_then(|mut table| table.remove("value")).and_then(|value| serde_json::to_value(value).ok());
+    let value =
+        parsed.and_then(|mut table| table.remove("value")).and_then(|value| serde_json::to_value(value).ok());
     value.unwrap_or_else(|| Value::String(text.to_owned()))
 }
 
@@ -196,7 +198,8 @@ mod tests {
     fn a_file_that_is_no_toml_is_named() {
         let error = resolve(Some("seed = = 3"), &[]).unwrap_err();
         assert!(error.contains("settings.toml"), "{error}");
-        let layers = SettingsLayers { file: Some(Path::new("/no/such/file.toml")), ..SettingsLayers::default() };
+        let layers =
+            SettingsLayers { file: Some(Path::new("/no/such/file.toml")), ..SettingsLayers::default() };
         assert!(layers.resolve().unwrap_err().to_string().contains("/no/such/file.toml"));
     }
 

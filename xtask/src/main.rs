@@ -1,2 +1,38 @@
-//! xtask
-fn main() {}
+//! Developer commands: `cargo xtask test`, `cargo xtask lint`.
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
+
+mod cargo;
+mod prerequisites;
+
+use clap::{Parser, Subcommand};
+
+/// Developer commands.
+#[derive(Parser)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Install what the tests need, then run formatting, lints and all tests.
+    Test,
+    /// Formatting and lints only.
+    Lint,
+}
+
+fn main() -> anyhow::Result<()> {
+    match Cli::parse().command {
+        Command::Test => {
+            prerequisites::provide()?;
+            lint()?;
+            cargo::test()
+        }
+        Command::Lint => lint(),
+    }
+}
+
+fn lint() -> anyhow::Result<()> {
+    cargo::run(&["fmt", "--all", "--check"])?;
+    cargo::run(&["clippy", "--workspace", "--all-targets", "--", "-D", "warnings"])
+}

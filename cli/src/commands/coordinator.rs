@@ -1,0 +1,75 @@
+//! `coordinator`: serves jobs to workers and clients.
+
+use std::{net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
+
+use clap::Args;
+use splat::raster::CpuEngine;
+use trackersplat_coordinator::{ServeOptions, serve};
+
+use super::cores;
+use crate::{error::CliError, interrupt};
+
+/// Arguments of `coordinator`.
+#[derive(Args, Debug)]
+pub(crate) struct CoordinatorArgs {
+    /// Folder of its state; the same folder goes on where it was.
+    #[arg(long, value_name = "DIR")]
+    root: PathBuf,
+
+    /// Where to listen; port 0 lets the system choose.
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7700")]
+    listen: SocketAddr,
+
+    /// Threads for static models and tracks [default: one per core].
+    #[arg(long, value_name = "N")]
+    compute_threads: Option<usize>,
+
+    /// Seconds between a worker's heartbeats.
+    #[arg(long, value_name = "SECONDS", default_value = "1", value_parser = seconds, help_heading = "Leases")]
+    heartbeat_interval: Duration,
+
+    /// Seconds without a heartbeat after which a lease expires.
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds, help_heading = "Leases")]
+    lease_duration: Duration,
+
+    /// Failed attempts that a frame may have.
+    #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Leases")]
+    max_attempts: u32,
+}
+
+pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
+    let interrupted = interrupt::token()?;
+    let options = ServeOptions {
+        root: args.root,
+        listen: args.listen,
+        compute_threads: args.compute_threads.unwrap_or_else(cores),
+        heartbeat_interval: args.heartbeat_interval,
+        lease_duration: args.lease_duration,
+        max_attempts: args.max_attempts,
+        dismiss_workers_when_idle: false,
+    };
+    let failed = |error| CliError::failed("coordinator", error);
+    let running = serve(options, Arc::new(CpuEngine), interrupted).await.map_err(failed)?;
+    // For scripts that let the system choose the port.
+    println!("http://{}", running.address);
+    running.finished().await.map_err(failed)
+}
+
+/// A number of seconds, with fractions.
+pub(super) fn seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| format!("'{text}' is no number of seconds"))?;
+    Duration::try_from_secs_f64(seconds).map_err(|error| format!("'{text}' seconds: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_have_fractions_and_are_not_negative() {
+        assert_eq!(seconds("0.5"), Ok(Duration::from_millis(500)));
+        for wrong in ["", "x", "-1", "NaN", "inf", "1e300"] {
+            assert!(seconds(wrong).is_err(), "{wrong}");
+        }
+    }
+}

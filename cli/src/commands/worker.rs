@@ -1,0 +1,50 @@
+//! `worker`: computes frames for a coordinator.
+
+use std::{path::PathBuf, sync::Arc, time::Duration};
+
+use clap::Args;
+use splat::raster::CpuEngine;
+use trackersplat_worker::{Exit, WorkerError, WorkerOptions};
+
+use super::{coordinator::seconds, cores};
+use crate::{error::CliError, interrupt};
+
+/// Arguments of `worker`.
+#[derive(Args, Debug)]
+pub(crate) struct WorkerArgs {
+    #[command(flatten)]
+    coordinator: crate::args::CoordinatorArgs,
+
+    /// Threads for the frame [default: one per core].
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+
+    /// Name of the worker; keep it across restarts [default: the one in --state-dir, else a new one].
+    #[arg(long, value_name = "NAME")]
+    id: Option<String>,
+
+    /// Folder that remembers the worker's name.
+    #[arg(long, value_name = "DIR")]
+    state_dir: Option<PathBuf>,
+
+    /// Seconds without a coordinator after which the worker gives up.
+    #[arg(long, value_name = "SECONDS", default_value = "300", value_parser = seconds)]
+    reconnect_for: Duration,
+}
+
+pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
+    let options = WorkerOptions {
+        coordinator: args.coordinator.coordinator,
+        threads: args.threads.unwrap_or_else(cores),
+        worker_id: args.id,
+        state_dir: args.state_dir,
+        reconnect_for: args.reconnect_for,
+    };
+    match trackersplat_worker::run(options, Arc::new(CpuEngine), interrupt::token()?).await {
+        Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
+        Err(
+            error @ (WorkerError::BadAddress(_) | WorkerError::Threads { .. } | WorkerError::State { .. }),
+        ) => Err(CliError::BadInput(error.to_string())),
+        Err(error) => Err(CliError::Failed(error.to_string())),
+    }
+}
