@@ -6,7 +6,12 @@ pub mod failure;
 pub mod ids;
 
 /// Messages and services of `trackersplat.v1`; the comments of the `.proto` files are the reference.
-#[allow(missing_docs, clippy::doc_markdown, reason = "generated from documented .proto files")]
+#[allow(
+    missing_docs,
+    clippy::doc_markdown,
+    clippy::allow_attributes_without_reason,
+    reason = "generated from documented .proto files"
+)]
 pub mod v1 {
     tonic::include_proto!("trackersplat.v1");
 }

@@ -24,8 +24,10 @@ use crate::{
 
 /// Longest wait for the first message.
 const REGISTER_WITHIN: Duration = Duration::from_secs(10);
-/// Heartbeat periods without any message after which a stream is dead.
+/// Heartbeat periods without any message after which a stream is dead, and the shortest such time: a worker that
+/// computes on every core may be late.
 const SILENT_PERIODS: u32 = 30;
+const SHORTEST_PATIENCE: Duration = Duration::from_secs(30);
 
 /// What workers say to the coordinator.
 pub(crate) struct WorkService {
@@ -91,7 +93,8 @@ impl WorkerStream {
         close: &CancellationToken,
     ) -> Result<Option<Status>, StoreError> {
         let options = &self.hub.options;
-        let patience = (options.heartbeat_interval * SILENT_PERIODS).max(options.lease_duration);
+        let patience = options.heartbeat_interval * SILENT_PERIODS;
+        let patience = patience.max(options.lease_duration).max(SHORTEST_PATIENCE);
         loop {
             let message = tokio::select! {
                 message = tokio::time::timeout(patience, self.incoming.message()) => message,

@@ -226,3 +226,49 @@ async fn a_static_model_with_nan_fails_the_job_and_names_the_file() {
     let frame_done = |event: &Event| matches!(event, Event::FrameState(f) if f.state() == FrameState::Done);
     assert!(!events.iter().filter_map(|event| event.event.as_ref()).any(frame_done));
 }
+
+#[tokio::test]
+async fn tracks_lead_from_the_key_frame_to_every_other_frame_of_the_training_views() {
+    let bench = Bench::start().await;
+    let request = SubmitRequest { settings_json: String::new(), ..bench.request() };
+    bench.submit(request.clone()).await.unwrap();
+    let (mut first, mut second) = (bench.worker("a").await, bench.worker("b").await);
+    let key = first.lease().await.job.unwrap();
+    assert!(key.key_frame && key.training_views.iter().all(|view| view.tracks.is_none()));
+    let other = second.lease().await.job.unwrap();
+    assert!(other.test_views.iter().all(|view| view.tracks.is_none()));
+    let mut digests = Vec::new();
+    for view in &other.training_views {
+        let digest = view.tracks.as_ref().unwrap().digest.clone();
+        let field = splat::formats::track_blob::decode(&bench.get(&digest).await.unwrap()).unwrap();
+        assert_eq!((field.width, field.height, field.positions.len()), (8, 6, 48));
+        digests.push(digest);
+    }
+    drop((first, second));
+
+    // The same clip with the same tracking settings uses the same tracks.
+    let seeded =
+        SubmitRequest { settings_json: r#"{"seed": 1}"#.into(), output: bench.path("out2"), ..request };
+    let seeded = bench.submit(seeded).await.unwrap().job_id;
+    let mut watch = bench.watch(&seeded, 0).await;
+    let in_frames =
+        |event: &Event| matches!(event, Event::JobState(changed) if changed.state() == JobState::Frames);
+    watch
+        .until(|event| {
+            assert!(!matches!(event, Event::Progress(p) if p.stage == "tracking"), "tracked again");
+            in_frames(event)
+        })
+        .await;
+}
+
+#[tokio::test]
+async fn exact_tracks_that_the_clip_lacks_fail_the_job_and_name_the_file() {
+    let bench = Bench::start().await;
+    let tracks = trackersplat_proto::v1::submit_request::Tracks::ExactTracks(Default::default());
+    let request = SubmitRequest { settings_json: String::new(), tracks: Some(tracks), ..bench.request() };
+    let job = bench.submit(request).await.unwrap().job_id;
+    let (state, failure) = bench.ended(&job).await;
+    let failure = failure.unwrap();
+    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::BadInput));
+    assert!(failure.message.contains("flow/cam"), "{}", failure.message);
+}

@@ -91,12 +91,8 @@ async fn a_silent_workers_lease_expires_and_its_report_is_refused() {
 }
 
 #[tokio::test]
-async fn heartbeats_keep_a_lease_and_a_stale_one_is_answered_with_cancel() {
-    let bench = Bench::start_with(|options| {
-        options.heartbeat_interval = Duration::from_millis(20);
-        options.lease_duration = Duration::from_secs(1);
-    })
-    .await;
+async fn heartbeats_are_progress_and_a_stale_one_is_answered_with_cancel() {
+    let bench = Bench::start().await;
     let job = bench.submitted().await;
     let mut worker = bench.worker("w").await;
     let lease = worker.lease().await;
@@ -111,11 +107,9 @@ async fn heartbeats_keep_a_lease_and_a_stale_one_is_answered_with_cancel() {
             total: 9,
         })
     };
-    // 1.5 lease durations of heartbeats.
-    for _ in 0..30 {
-        worker.send(heartbeat(&lease.lease_id)).await;
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+    // Workers send one again and again; one alone may be dropped before the watch has begun.
+    watch.until(|event| matches!(event, Event::Workers(_))).await;
+    worker.send(heartbeat(&lease.lease_id)).await;
     let seen = watch.until(|event| matches!(event, Event::Progress(p) if p.stage == "refine")).await;
     let Some(Event::Progress(progress)) = seen.event else { panic!("{seen:?}") };
     assert_eq!((progress.frame, progress.done, progress.total, progress.worker_id.as_str()), (1, 3, 9, "w"));
@@ -125,7 +119,10 @@ async fn heartbeats_keep_a_lease_and_a_stale_one_is_answered_with_cancel() {
         other => panic!("{other:?}"),
     }
     let success = bench.result(&lease).await;
-    assert!(worker.report(&lease, Outcome::Success(success)).await.accepted, "the lease was kept");
+    assert!(
+        worker.report(&lease, Outcome::Success(success)).await.accepted,
+        "the stale heartbeat did no harm"
+    );
 }
 
 #[tokio::test]
