@@ -1,12 +1,6 @@
 //! A coordinator and its workers for one job, on this machine.
 
-use std::{
-    fs::{File, TryLockError},
-    net::SocketAddr,
-    path::Path,
-    sync::Arc,
-    time::Duration,
-};
+use std::{net::SocketAddr, path::Path, sync::Arc, time::Duration};
 
 use splat::raster::CpuEngine;
 use tokio::sync::mpsc;
@@ -48,14 +42,13 @@ impl EmbeddedRun<'_> {
                 format!("{error}; give an output folder that can be written"),
             )
         })?;
-        let _lock = lock(&state)?;
         let shutdown = CancellationToken::new();
         let coordinator = self.serve(&state, &shutdown).await?;
         let address = format!("http://{}", coordinator.address);
         let worked = self.work(&state, &address, interrupted).await;
         shutdown.cancel();
         // Only now: a worker that dies under a live coordinator would count as lost.
-        let ended = coordinator.finished().await.map_err(|error| CliError::failed("coordinator", error));
+        let ended = coordinator.finished().await;
         let (outcome, workers) = worked?;
         if let Some(workers) = workers {
             workers.end(FAREWELL).await;
@@ -71,9 +64,7 @@ impl EmbeddedRun<'_> {
             dismiss_workers_when_idle: self.workers > 0,
             ..ServeOptions::default()
         };
-        serve(options, Arc::new(CpuEngine), shutdown.clone())
-            .await
-            .map_err(|error| CliError::failed("coordinator", error))
+        Ok(serve(options, Arc::new(CpuEngine), shutdown.clone()).await?)
     }
 
     async fn work(
@@ -129,36 +120,4 @@ fn obituary(ended: &EndedWorker) -> String {
         ended.left,
         ended.log.display()
     )
-}
-
-/// Keeps a second run out of the same folder for as long as the file is held.
-fn lock(state: &Path) -> Result<File, CliError> {
-    let path = state.join("lock");
-    let file = File::create(&path).map_err(|error| CliError::bad_input(path.display(), error))?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => {
-            let why = "another trackersplat works in this folder; wait for it, or give another output folder";
-            Err(CliError::bad_input(state.display(), why))
-        }
-        Err(TryLockError::Error(error)) => Err(CliError::bad_input(path.display(), error)),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used, reason = "tests")]
-
-    use super::*;
-
-    #[test]
-    fn one_run_at_a_time_works_in_a_folder() {
-        let folder = tempfile::tempdir().unwrap();
-        let first = lock(folder.path()).unwrap();
-        let error = lock(folder.path()).unwrap_err();
-        assert_eq!(error.exit_code(), 3);
-        assert!(error.to_string().contains("another trackersplat"), "{error}");
-        drop(first);
-        lock(folder.path()).unwrap();
-    }
 }

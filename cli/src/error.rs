@@ -4,6 +4,7 @@ use std::fmt::Display;
 
 use thiserror::Error;
 use tonic::{Code, Status};
+use trackersplat_coordinator::ServeError;
 
 /// What `--help` says about exit codes.
 pub(crate) const EXIT_CODES: &str = "Exit codes:
@@ -57,6 +58,18 @@ impl From<Status> for CliError {
         match status.code() {
             Code::InvalidArgument | Code::FailedPrecondition | Code::NotFound => Self::BadInput(message),
             _ => Self::Failed(message),
+        }
+    }
+}
+
+impl From<ServeError> for CliError {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Options(_)
+            | ServeError::Root { .. }
+            | ServeError::InUse { .. }
+            | ServeError::Listen { .. } => Self::BadInput(error.to_string()),
+            _ => Self::failed("coordinator", error),
         }
     }
 }

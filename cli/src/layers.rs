@@ -94,13 +94,10 @@ impl Layered {
     fn find(&mut self, path: &[String]) -> Result<&mut Value, String> {
         let mut place = &mut self.tree;
         for (depth, key) in path.iter().enumerate() {
-            let section =
-                if depth == 0 { "the settings".to_owned() } else { format!("'{}'", path[..depth].join(".")) };
             let known = keys(place);
-            place = place
-                .as_object_mut()
-                .and_then(|table| table.get_mut(key))
-                .ok_or_else(|| format!("unknown setting '{}'; {section} has: {known}", path.join(".")))?;
+            place = place.as_object_mut().and_then(|table| table.get_mut(key)).ok_or_else(|| {
+                format!("unknown setting '{}'; known there: {known}", path[..=depth].join("."))
+            })?;
         }
         Ok(place)
     }

@@ -22,8 +22,16 @@ pub(crate) struct LogArgs {
 }
 
 /// Starts logging. `RUST_LOG` overrules the flags.
-pub(crate) fn start(args: &LogArgs) {
-    let filter = EnvFilter::builder().with_default_directive(level(args).into()).from_env_lossy();
+///
+/// A command that watches its own embedded coordinator hears every change twice; of the coordinator it then says
+/// warnings only.
+pub(crate) fn start(args: &LogArgs, watches_own_coordinator: bool) {
+    let level = level(args);
+    let coordinator =
+        if watches_own_coordinator && args.verbose == 0 { level.min(LevelFilter::WARN) } else { level };
+    let default = format!("{level},trackersplat_coordinator={coordinator}");
+    let wanted = std::env::var(EnvFilter::DEFAULT_ENV).unwrap_or(default);
+    let filter = EnvFilter::builder().parse_lossy(wanted);
     let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
     if args.log_json {
         logs.json().init();

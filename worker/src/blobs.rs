@@ -7,18 +7,17 @@ use futures::StreamExt;
 use object_store::{ObjectStoreExt, local::LocalFileSystem, path::Path};
 use thiserror::Error;
 use tonic::transport::Channel;
-use trackersplat_proto::v1::{
-    Blob, FailureKind, GetBlobRequest, PutBlobChunk, Welcome, blobs_client::BlobsClient,
+use trackersplat_proto::{
+    CHUNK_BYTES,
+    ids::{InvalidId, check_digest},
+    v1::{Blob, FailureKind, GetBlobRequest, PutBlobChunk, Welcome, blobs_client::BlobsClient},
 };
-
-/// Bytes per streamed chunk, well below gRPC's limit of 4 MiB a message.
-const CHUNK_BYTES: usize = 1 << 20;
 
 /// Why bulk could not be read or written.
 #[derive(Debug, Error)]
 pub(crate) enum BlobError {
-    #[error("'{0}' is not a BLAKE3 digest of 64 hexadecimal digits; this is a defect of the coordinator")]
-    BadDigest(String),
+    #[error(transparent)]
+    BadDigest(#[from] InvalidId),
     #[error(
         "blob {digest}: expected {expected}, got {got}; the store is damaged or the transfer was cut short"
     )]
@@ -88,10 +87,7 @@ pub(crate) fn digest_of(bytes: &[u8]) -> String {
 
 /// A blob's place in the store: `ab/abcdef…`, so that no directory holds every file.
 fn store_path(digest: &str) -> Result<Path, BlobError> {
-    let is_hexadecimal = digest.bytes().all(|c| matches!(c, b'0'..=b'9' | b'a'..=b'f'));
-    if digest.len() != 64 || !is_hexadecimal {
-        return Err(BlobError::BadDigest(digest.to_owned()));
-    }
+    check_digest(digest)?;
     Ok(Path::from(format!("{}/{digest}", &digest[..2])))
 }
 

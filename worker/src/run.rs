@@ -17,8 +17,12 @@ use tokio::{
 };
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
-use trackersplat_proto::v1::{
-    GoingAway, Heartbeat, Lease, LeaseRequest, Register, Report, coordinator_message, worker_message,
+use trackersplat_proto::{
+    ids::{InvalidId, check_worker_id},
+    v1::{
+        Failure, FailureKind, GoingAway, Heartbeat, Lease, LeaseRequest, Register, Report,
+        coordinator_message, worker_message,
+    },
 };
 
 use crate::{
@@ -67,6 +71,9 @@ pub enum WorkerError {
     /// The address is no `http://host:port`.
     #[error("coordinator address '{0}' is not of the form http://host:port")]
     BadAddress(String),
+    /// The name cannot be sent.
+    #[error(transparent)]
+    BadName(#[from] InvalidId),
     /// No thread pool of that size.
     #[error("cannot start {threads} worker threads: {reason}; give a smaller number, at least 1")]
     Threads {
@@ -181,6 +188,7 @@ impl Worker {
         let channel = connection::channel(&options.coordinator)?;
         let incarnation = uuid::Uuid::now_v7();
         let worker_id = worker_id(&options, incarnation)?;
+        check_worker_id(&worker_id)?;
         let pool = thread_pool(options.threads)?;
         let mut hasher = std::hash::DefaultHasher::new();
         incarnation.hash(&mut hasher);
@@ -383,8 +391,8 @@ async fn finished(running: &mut Option<RunningLease>) -> Option<Outcome> {
     let Some(running) = running else { return pending().await };
     match (&mut running.task).await {
         Ok(outcome) => outcome,
-        Err(error) => Some(Outcome::Failure(trackersplat_proto::v1::Failure {
-            kind: trackersplat_proto::v1::FailureKind::Bug.into(),
+        Err(error) => Some(Outcome::Failure(Failure {
+            kind: FailureKind::Bug.into(),
             message: format!("the frame job's task: {error}"),
         })),
     }

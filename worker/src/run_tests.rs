@@ -12,7 +12,7 @@ use splat::{
     gaussians::delta,
 };
 use tonic::Status;
-use trackersplat_proto::v1::{CancelLease, Dismiss, FailureKind, report};
+use trackersplat_proto::v1::{CancelLease, Dismiss, report};
 
 use super::*;
 use crate::test_coordinator::{Session, TestCoordinator};
@@ -345,4 +345,12 @@ async fn a_worker_without_threads_is_refused() {
     let coordinator = TestCoordinator::start().await;
     let (worker, _shutdown) = start_with(WorkerOptions { threads: 0, ..options(&coordinator) }, shift());
     assert!(matches!(worker.await.unwrap(), Err(WorkerError::Threads { threads: 0, .. })));
+}
+
+#[tokio::test]
+async fn a_name_that_cannot_be_sent_is_refused_before_anything_starts() {
+    let coordinator = TestCoordinator::start().await;
+    let options = WorkerOptions { worker_id: Some("a name/with a path".into()), ..options(&coordinator) };
+    let (worker, _shutdown) = start_with(options, shift());
+    assert!(matches!(worker.await.unwrap(), Err(WorkerError::BadName(_))));
 }

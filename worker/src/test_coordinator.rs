@@ -92,7 +92,6 @@ impl TestCoordinator {
             static_model: Some(self.store(&ply::write_ply(&two_gaussians()))),
             training_views: vec![view("cam00", 0.2), view("cam01", 0.4)],
             test_views: vec![view("test00", 0.6)],
-            ..FrameJob::default()
         }
     }
 

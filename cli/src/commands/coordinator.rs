@@ -48,11 +48,10 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
         max_attempts: args.max_attempts,
         dismiss_workers_when_idle: false,
     };
-    let failed = |error| CliError::failed("coordinator", error);
-    let running = serve(options, Arc::new(CpuEngine), interrupted).await.map_err(failed)?;
+    let running = serve(options, Arc::new(CpuEngine), interrupted).await?;
     // For scripts that let the system choose the port.
     println!("http://{}", running.address);
-    running.finished().await.map_err(failed)
+    Ok(running.finished().await?)
 }
 
 /// A number of seconds, with fractions.

@@ -63,6 +63,13 @@ pub(crate) enum Command {
     Fetch(fetch::FetchArgs),
 }
 
+impl Command {
+    /// Whether the command runs a coordinator of its own and watches it.
+    pub(crate) fn embeds_coordinator(&self) -> bool {
+        matches!(self, Self::Reconstruct(_) | Self::Demo(_))
+    }
+}
+
 /// Runs a command to its end.
 pub(crate) fn run(cli: Cli) -> Result<(), CliError> {
     let Cli { command, logs } = cli;

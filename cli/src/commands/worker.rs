@@ -43,7 +43,10 @@ pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
     match trackersplat_worker::run(options, Arc::new(CpuEngine), interrupt::token()?).await {
         Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
         Err(
-            error @ (WorkerError::BadAddress(_) | WorkerError::Threads { .. } | WorkerError::State { .. }),
+            error @ (WorkerError::BadAddress(_)
+            | WorkerError::BadName(_)
+            | WorkerError::Threads { .. }
+            | WorkerError::State { .. }),
         ) => Err(CliError::BadInput(error.to_string())),
         Err(error) => Err(CliError::Failed(error.to_string())),
     }

@@ -34,8 +34,9 @@ pub(super) fn draw(input: &AssemblyInput<'_>) -> Result<Option<Image>, AssemblyE
 
 /// At most `count` of `0..len`, evenly spread, the first and the last among them.
 fn spread(len: usize, count: usize) -> BTreeSet<usize> {
-    let steps = count.min(len).saturating_sub(1);
-    let place = |step: usize| if steps == 0 { 0 } else { (step * (len - 1) + steps / 2) / steps };
+    // One frame stands at the start, whatever it is divided by.
+    let steps = count.min(len).saturating_sub(1).max(1);
+    let place = |step: usize| (step * (len - 1) + steps / 2) / steps;
     (0..count.min(len)).map(place).collect()
 }
 
