@@ -31,4 +31,6 @@ pub mod raster;
 pub mod refine;
 pub mod settings;
 pub mod static_model;
+#[cfg(test)]
+mod testing;
 pub mod tracking;

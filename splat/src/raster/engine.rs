@@ -198,6 +198,10 @@ pub(super) fn scatter(
                 gradient,
                 &mut sh[..stride],
             );
+            if !(geometry.is_finite() && sh.iter().all(|value| value.is_finite())) {
+                // Beyond single precision there is no direction to follow; a step of infinity would spread.
+                return (GeometryGradient::default(), [0.0; 48]);
+            }
             (geometry, sh)
         })
         .collect();

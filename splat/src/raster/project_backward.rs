@@ -24,6 +24,17 @@ pub struct GeometryGradient {
     pub projected_mean: [f32; 2],
 }
 
+impl GeometryGradient {
+    pub(super) fn is_finite(&self) -> bool {
+        let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
+        finite(&self.mean)
+            && finite(&self.rotation)
+            && finite(&self.log_scale)
+            && self.logit_opacity.is_finite()
+            && finite(&self.projected_mean)
+    }
+}
+
 /// Turns the gradient of a footprint into that of its Gaussian; adds the colour's share to `sh_gradient` (`K × 3`).
 pub fn project_backward(
     gaussians: &Gaussians,

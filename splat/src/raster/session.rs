@@ -4,7 +4,7 @@ use super::engine::{Pass, scatter};
 use crate::{
     cameras::Camera,
     engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
-    gaussians::{Gaussians, gradients::GaussianGradients},
+    gaussians::{Gaussians, gradients::GaussianGradients, validate::validate},
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
     optim::{Adam, LearningRates},
@@ -142,6 +142,7 @@ fn check(input: &SessionInput) -> Result<(), EngineError> {
     if input.views.is_empty() {
         return Err(EngineError::InvalidInput("no training view; give at least one".into()));
     }
+    validate(&input.gaussians).map_err(|error| EngineError::InvalidInput(error.to_string()))?;
     let count = input.gaussians.len();
     if !(input.frozen.is_empty() || input.frozen.len() == count) {
         return Err(EngineError::InvalidInput(format!(
@@ -155,6 +156,14 @@ fn check(input: &SessionInput) -> Result<(), EngineError> {
             return Err(EngineError::InvalidInput(format!(
                 "training image {number} is {}x{}, its camera {}x{}",
                 image.width, image.height, camera.width, camera.height
+            )));
+        }
+        if let Some(mask) = &view.mask
+            && (mask.width, mask.height) != (camera.width, camera.height)
+        {
+            return Err(EngineError::InvalidInput(format!(
+                "training mask {number} is {}x{}, its camera {}x{}",
+                mask.width, mask.height, camera.width, camera.height
             )));
         }
     }

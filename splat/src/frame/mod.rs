@@ -1,5 +1,8 @@
 //! One frame job: motion compensation, rollback, refinement, evaluation. A pure function of its input.
 
+#[cfg(test)]
+mod tests;
+
 use std::{ops::ControlFlow, sync::Arc};
 
 use serde::{Deserialize, Serialize};
@@ -8,7 +11,7 @@ use thiserror::Error;
 use crate::{
     cameras::Camera,
     engine::{Engine, EngineError, TrainingView},
-    gaussians::Gaussians,
+    gaussians::{Gaussians, validate::validate},
     image::{Image, Mask},
     metrics,
     motion::{self, MotionOrigin, MotionView},
@@ -175,6 +178,7 @@ fn check(input: &FrameInput) -> Result<(), FrameError> {
     if input.training_views.is_empty() {
         return Err(FrameError::BadInput("a frame without training views; hold out fewer".into()));
     }
+    validate(&input.static_model).map_err(|error| FrameError::BadInput(format!("static model: {error}")))?;
     for view in input.training_views.iter().chain(&input.test_views) {
         let size = (view.camera.width, view.camera.height);
         if (view.image.width, view.image.height) != size {

@@ -1,0 +1,40 @@
+//! Copies of the bundled clip that a test may damage.
+
+use std::path::Path;
+
+/// Copies the bundled clip's first `frames` frames of its first `views` training views and one test view to `target`.
+///
+/// # Panics
+/// If the file system refuses.
+pub fn copy(target: &Path, frames: u32, views: usize) {
+    let source = crate::program::demo_clip();
+    let cameras: Vec<String> =
+        (0..views).map(|view| format!("cam{view:02}")).chain(["test00".to_owned()]).collect();
+    std::fs::create_dir_all(target.join("transforms")).expect("a scratch folder");
+    for frame in 1..=frames {
+        let name = format!("transforms/frame_{frame:04}.json");
+        let text = std::fs::read_to_string(source.join(&name)).expect("the bundled clip");
+        let mut document: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+        let entries = document["frames"].as_array_mut().expect("a list of frames");
+        entries.retain(|entry| cameras.iter().any(|camera| entry["camera"] == camera.as_str()));
+        std::fs::write(target.join(&name), document.to_string()).expect("a scratch file");
+        for camera in &cameras {
+            for file in [
+                format!("images/{camera}/frame_{frame:04}.webp"),
+                format!("masks/{camera}/frame_{frame:04}.png"),
+            ] {
+                copy_file(&source, target, &file);
+            }
+        }
+    }
+    for camera in cameras.iter().filter(|camera| camera.starts_with("cam")) {
+        copy_file(&source, target, &format!("flow/{camera}.npz"));
+    }
+    copy_file(&source, target, "points3D.ply");
+}
+
+fn copy_file(source: &Path, target: &Path, name: &str) {
+    let to = target.join(name);
+    std::fs::create_dir_all(to.parent().expect("a file has a folder")).expect("a scratch folder");
+    std::fs::copy(source.join(name), &to).unwrap_or_else(|error| panic!("{name}: {error}"));
+}

@@ -1,0 +1,184 @@
+//! What a run survives, with real processes and SIGKILL: the result has the same bytes whatever happens.
+#![cfg(target_os = "linux")]
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+    sync::OnceLock,
+};
+
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
+use tempfile::TempDir;
+use trackersplat_tests::{
+    clips,
+    program::{self, Running},
+};
+
+/// Short enough for a gate, long enough to be killed in the middle of a frame.
+const SETTINGS: [&str; 13] = [
+    "-v",
+    "--tracks",
+    "exact",
+    "--set",
+    "static_model.max_steps=120",
+    "--set",
+    "static_model.densify_until=0.0",
+    "--set",
+    "refine.iterations=150",
+    "--set",
+    "refine.plateau_window=0",
+    "--set",
+    "motion.field_rounds=1",
+];
+
+fn clip() -> &'static Path {
+    static CLIP: OnceLock<TempDir> = OnceLock::new();
+    CLIP.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        clips::copy(folder.path(), 4, 4);
+        folder
+    })
+    .path()
+}
+
+fn arguments(output: &Path, workers: usize) -> Vec<String> {
+    let fixed = ["reconstruct", clip().to_str().unwrap(), "--out", output.to_str().unwrap(), "--workers"];
+    fixed.iter().chain([&workers.to_string().as_str()]).chain(&SETTINGS).map(|&a| a.to_owned()).collect()
+}
+
+fn results(output: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut files = BTreeMap::new();
+    for folder in ["frames", "deltas"] {
+        for entry in std::fs::read_dir(output.join(folder)).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.strip_prefix(output).unwrap().to_owned();
+            files.insert(name, std::fs::read(path).unwrap());
+        }
+    }
+    files.insert("static.ply".into(), std::fs::read(output.join("static.ply")).unwrap());
+    files
+}
+
+/// The files of an undisturbed run with two workers.
+fn undisturbed() -> &'static BTreeMap<PathBuf, Vec<u8>> {
+    static FILES: OnceLock<BTreeMap<PathBuf, Vec<u8>>> = OnceLock::new();
+    FILES.get_or_init(|| {
+        let output = tempfile::tempdir().unwrap();
+        let (code, log) = program::run(arguments(output.path(), 2));
+        assert_eq!(code, 0, "{log}");
+        results(output.path())
+    })
+}
+
+fn assert_undisturbed(output: &Path) {
+    let files = results(output);
+    let (found, expected): (Vec<_>, Vec<_>) = (files.keys().collect(), undisturbed().keys().collect());
+    assert_eq!(found, expected, "the same files");
+    for (name, bytes) in &files {
+        assert!(bytes == &undisturbed()[name], "{} has the same bytes", name.display());
+    }
+}
+
+fn signal(process: i32, signal: Signal) {
+    kill(Pid::from_raw(process), signal).unwrap();
+}
+
+fn attempts(output: &Path) -> BTreeMap<u64, u64> {
+    let text = std::fs::read_to_string(output.join("sequence.json")).unwrap();
+    let sequence: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let frames = sequence["frames"].as_array().unwrap();
+    frames.iter().map(|f| (f["number"].as_u64().unwrap(), f["attempts"].as_u64().unwrap())).collect()
+}
+
+fn wait_for_work(run: &mut Running) {
+    run.wait_for(&["frame=2", "state=\"leased\""]);
+    run.wait_for(&["frame=3", "state=\"leased\""]);
+    for frame in ["frame=2", "frame=3"] {
+        run.wait_for(&["progress", "stage=\"refine\"", frame]);
+    }
+}
+
+#[test]
+fn one_worker_and_two_and_a_second_run_give_the_same_bytes() {
+    for workers in [1, 2] {
+        let output = tempfile::tempdir().unwrap();
+        let (code, log) = program::run(arguments(output.path(), workers));
+        assert_eq!(code, 0, "{log}");
+        assert_undisturbed(output.path());
+    }
+}
+
+#[test]
+fn a_worker_killed_in_the_middle_of_a_frame_changes_nothing() {
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(arguments(output.path(), 2));
+    wait_for_work(&mut run);
+    signal(run.children()[0], Signal::SIGKILL);
+    let status = run.wait();
+    assert!(status.success(), "{}", run.log());
+    assert_undisturbed(output.path());
+    let attempts = attempts(output.path());
+    assert!(attempts.values().any(|&count| count == 2), "a lost attempt was repeated: {attempts:?}");
+}
+
+#[test]
+fn without_workers_the_run_waits_says_so_and_goes_on_when_one_joins() {
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(arguments(output.path(), 2));
+    let line = run.wait_for(&["started; coordinator at http://"]);
+    let address = line.split_once("coordinator at ").unwrap().1.split_once(',').unwrap().0.to_owned();
+    wait_for_work(&mut run);
+    for worker in run.children() {
+        signal(worker, Signal::SIGKILL);
+    }
+    let said = run.wait_for(&["no worker connected"]);
+    assert!(said.contains(&format!("trackersplat worker --coordinator {address}")), "{said}");
+    let state = tempfile::tempdir().unwrap();
+    let mut worker = program::start([
+        "worker",
+        "--coordinator",
+        &address,
+        "--threads",
+        "1",
+        "--state-dir",
+        state.path().to_str().unwrap(),
+    ]);
+    let status = run.wait();
+    assert!(status.success(), "{}", run.log());
+    assert!(worker.wait().success(), "dismissed: {}", worker.log());
+    assert_undisturbed(output.path());
+}
+
+#[test]
+fn a_killed_coordinator_goes_on_without_computing_a_frame_twice() {
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(arguments(output.path(), 2));
+    run.wait_for(&["frame=2", "state=\"done\""]);
+    run.kill();
+    let mut again = program::start(arguments(output.path(), 2));
+    assert!(again.wait().success(), "{}", again.log());
+    let log = again.log();
+    assert!(log.contains("resumed=true"), "{log}");
+    for frame in [1, 2] {
+        let leased = format!("frame={frame} state=\"leased\" attempt=2");
+        assert!(!log.contains(&leased), "frame {frame} was finished:\n{log}");
+    }
+    assert_undisturbed(output.path());
+}
+
+#[test]
+fn an_interrupted_run_is_resumed_by_the_same_command() {
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(arguments(output.path(), 2));
+    run.wait_for(&["frame=2", "state=\"done\""]);
+    signal(run.id() as i32, Signal::SIGINT);
+    assert_eq!(run.wait().code(), Some(130), "{}", run.log());
+    let (code, log) = program::run(arguments(output.path(), 2));
+    assert_eq!(code, 0, "{log}");
+    assert!(log.contains("resumed=true"), "{log}");
+    assert_undisturbed(output.path());
+}
