@@ -86,3 +86,74 @@ impl Settings {
         }
     }
 }
+
+/// Ranges of settings, checked wherever settings are read.
+pub(crate) mod range {
+    use serde::{Deserialize, Deserializer, de::Error};
+
+    /// A share or a rate: 0 to 1.
+    pub(crate) fn unit<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
+        let value = f32::deserialize(from)?;
+        if (0.0..=1.0).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not between 0 and 1")))
+    }
+
+    /// A number of steps: at most a million.
+    pub(crate) fn steps<'de, D: Deserializer<'de>>(from: D) -> Result<u32, D::Error> {
+        let value = u32::deserialize(from)?;
+        if value <= 1_000_000 {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is more than 1000000 steps")))
+    }
+
+    /// A number of Gaussians: 1 to a hundred million.
+    pub(crate) fn gaussians<'de, D: Deserializer<'de>>(from: D) -> Result<usize, D::Error> {
+        let value = usize::deserialize(from)?;
+        if (1..=100_000_000).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not between 1 and 100000000 Gaussians")))
+    }
+
+    /// A spherical-harmonic degree: 0 to 3.
+    pub(crate) fn degree<'de, D: Deserializer<'de>>(from: D) -> Result<u32, D::Error> {
+        let value = u32::deserialize(from)?;
+        if value <= crate::gaussians::sh::MAX_DEGREE {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("degree {value} is not between 0 and 3")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_survives_the_wire() {
+        for quality in [Quality::Draft, Quality::Balanced, Quality::Best] {
+            let settings = Settings::preset(quality);
+            let json = serde_json::to_string(&settings).expect("settings are plain numbers");
+            assert_eq!(serde_json::from_str::<Settings>(&json).expect("own settings are in range"), settings);
+        }
+    }
+
+    #[test]
+    fn unknown_keys_and_values_out_of_range_are_refused() {
+        for (json, said) in [
+            (r#"{"refine":{"iterationss":1}}"#, "iterationss"),
+            (r#"{"refine":{"iterations":4000000000}}"#, "4000000000"),
+            (r#"{"refine":{"dssim_weight":1.5}}"#, "1.5"),
+            (r#"{"refine":{"mean_rate":-0.1}}"#, "-0.1"),
+            (r#"{"static_model":{"max_gaussians":0}}"#, "0 is not"),
+            (r#"{"static_model":{"random_points":1000000000000}}"#, "1000000000000"),
+            (r#"{"static_model":{"sh_degree":4}}"#, "degree 4"),
+        ] {
+            let error = serde_json::from_str::<Settings>(json).expect_err(json).to_string();
+            assert!(error.contains(said), "{json}: {error}");
+        }
+    }
+}

@@ -1,5 +1,6 @@
 //! One frame job: motion compensation, rollback, refinement, evaluation. A pure function of its input.
 
+mod rest;
 #[cfg(test)]
 mod tests;
 
@@ -94,10 +95,12 @@ pub struct FrameReport {
     pub before: Vec<ViewMetrics>,
     /// Held-out metrics of the result.
     pub after: Vec<ViewMetrics>,
-    /// Where the motions came from.
+    /// Where the motions came from, as motion compensation found them; if `rolled_back`, none was applied.
     pub motion: MotionCounts,
     /// Whether motion compensation rendered worse than no motion on the training views and was undone.
     pub rolled_back: bool,
+    /// Gaussians whose refinement left the range of numbers; they are as motion compensation left them.
+    pub restored: usize,
     /// Optimisation steps taken.
     pub refine_steps: u32,
     /// Mean training loss at the start and at the end of refinement.
@@ -151,7 +154,7 @@ pub fn reconstruct_frame(
         report.after = report.before.clone();
         return Ok(FrameResult { gaussians: start.gaussians, report });
     }
-    let refined = refine::refine(
+    let mut refined = refine::refine(
         engine,
         RefineInput {
             gaussians: start.gaussians.clone(),
@@ -167,6 +170,7 @@ pub fn reconstruct_frame(
         },
     )?
     .ok_or(FrameError::Cancelled)?;
+    report.restored = restore_broken(&mut refined.gaussians, &start.gaussians);
     report.refine_steps = refined.steps;
     report.refine_loss = refined.loss;
     advance("evaluate", 0, 1)?;
@@ -208,12 +212,6 @@ struct Start {
 }
 
 fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameError> {
-    let still = |rolled_back, counts| Start {
-        gaussians: input.static_model.as_ref().clone(),
-        frozen: Vec::new(),
-        counts,
-        rolled_back,
-    };
     let views: Vec<MotionView> = input
         .training_views
         .iter()
@@ -222,20 +220,42 @@ fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameErr
         })
         .collect();
     if input.is_key_frame || views.is_empty() || input.settings.motion_source == MotionSource::None {
-        return Ok(still(false, MotionCounts::default()));
+        return Ok(Start {
+            gaussians: input.static_model.as_ref().clone(),
+            frozen: Vec::new(),
+            counts: MotionCounts::default(),
+            rolled_back: false,
+        });
     }
     let field = motion::estimate(engine, &input.static_model, &views, &input.settings.motion)?;
     let counts = count(&field.origin);
-    let gaussians = motion::apply(&input.static_model, &field);
-    if training_psnr(engine, &gaussians, input)? < training_psnr(engine, &input.static_model, input)? {
-        return Ok(still(true, counts));
+    let moved = motion::apply(&input.static_model, &field);
+    let rolled_back =
+        training_psnr(engine, &moved, input)? < training_psnr(engine, &input.static_model, input)?;
+    let gaussians = if rolled_back { input.static_model.as_ref().clone() } else { moved };
+    let frozen = rest::frozen(
+        engine,
+        &gaussians,
+        &field.origin,
+        &input.training_views,
+        input.settings.background,
+        &input.settings.refine,
+    )?;
+    Ok(Start { gaussians, frozen, counts, rolled_back })
+}
+
+/// Puts Gaussians with a parameter that is no finite number back to where they started; returns how many.
+fn restore_broken(gaussians: &mut Gaussians, start: &Gaussians) -> usize {
+    let broken: Vec<usize> = (0..gaussians.len()).filter(|&index| !gaussians.is_finite(index)).collect();
+    let stride = gaussians.sh_coefficients() * 3;
+    for &index in &broken {
+        gaussians.means[index] = start.means[index];
+        gaussians.rotations[index] = start.rotations[index];
+        gaussians.log_scales[index] = start.log_scales[index];
+        gaussians.logit_opacities[index] = start.logit_opacities[index];
+        gaussians.sh[index * stride..(index + 1) * stride].copy_from_slice(start.sh_of(index));
     }
-    let frozen = if input.settings.refine.freeze_static {
-        field.origin.iter().map(|&origin| origin == MotionOrigin::Static).collect()
-    } else {
-        Vec::new()
-    };
-    Ok(Start { gaussians, frozen, counts, rolled_back: false })
+    broken.len()
 }
 
 fn count(origins: &[MotionOrigin]) -> MotionCounts {

@@ -78,6 +78,17 @@ impl Gaussians {
         sigmoid(self.logit_opacities[index].into())
     }
 
+    /// Whether every parameter of Gaussian `index` is a finite number and its quaternion has a direction.
+    pub fn is_finite(&self, index: usize) -> bool {
+        let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
+        finite(&self.means[index])
+            && finite(&self.rotations[index])
+            && self.rotations[index] != [0.0; 4]
+            && finite(&self.log_scales[index])
+            && self.logit_opacities[index].is_finite()
+            && finite(self.sh_of(index))
+    }
+
     /// The Gaussians of `indices`, in that order.
     pub fn select(&self, indices: &[usize]) -> Self {
         Self {

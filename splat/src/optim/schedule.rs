@@ -37,8 +37,9 @@ pub struct Plateau {
 }
 
 impl Plateau {
-    /// `window` steps per window; 0 never reaches a plateau.
-    pub fn new(window: u32, improvement: f32) -> Self {
+    /// At least `window` steps per window, in whole epochs of `views`, as views differ in their loss; 0 never reaches a plateau.
+    pub fn new(window: u32, improvement: f32, views: usize) -> Self {
+        let window = window.next_multiple_of(u32::try_from(views.max(1)).unwrap_or(1));
         Self { window, improvement, seen: 0, sum: 0.0, previous: f64::INFINITY }
     }
 
@@ -78,16 +79,16 @@ mod tests {
 
     #[test]
     fn a_falling_loss_is_no_plateau_and_a_flat_one_is() {
-        let mut plateau = Plateau::new(10, 0.01);
+        let mut plateau = Plateau::new(10, 0.01, 5);
         assert!(!(0..50).any(|step| plateau.is_reached(1.0 / (1.0 + step as f32))));
-        let mut plateau = Plateau::new(10, 0.01);
+        let mut plateau = Plateau::new(10, 0.01, 5);
         let stop = (0..50).position(|_| plateau.is_reached(0.5));
         assert_eq!(stop, Some(19), "at the end of the second window");
     }
 
     #[test]
     fn no_window_means_no_plateau() {
-        let mut plateau = Plateau::new(0, 1.0);
+        let mut plateau = Plateau::new(0, 1.0, 3);
         assert!(!(0..100).any(|_| plateau.is_reached(0.5)));
     }
 }

@@ -52,7 +52,8 @@ pub fn refine(
     settings: &RefineSettings,
     progress: &mut dyn FnMut(u32, u32) -> ControlFlow<()>,
 ) -> Result<Option<Refined>, EngineError> {
-    if settings.iterations == 0 || input.gaussians.is_empty() {
+    let all_frozen = !input.frozen.is_empty() && input.frozen.iter().all(|&frozen| frozen);
+    if settings.iterations == 0 || input.gaussians.is_empty() || all_frozen {
         return Ok(Some(Refined { gaussians: input.gaussians, steps: 0, loss: [0.0; 2] }));
     }
     let cameras: Vec<&Camera> = input.views.iter().map(|view| &view.camera).collect();
@@ -68,8 +69,8 @@ pub fn refine(
     })?;
     let mut random = ChaCha8Rng::seed_from_u64(input.seed);
     let mut epochs = Epochs::new(views);
-    let mut plateau = Plateau::new(settings.plateau_window, settings.plateau_improvement);
-    let mut losses = Vec::with_capacity(settings.iterations as usize);
+    let mut plateau = Plateau::new(settings.plateau_window, settings.plateau_improvement, views);
+    let mut losses = Vec::new();
     for step in 0..settings.iterations {
         let view = epochs.next(&mut random);
         let loss = session.step(view, &rates(settings, step, extent, sh_degree))?.loss;

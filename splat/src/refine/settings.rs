@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::settings::Quality;
+use crate::settings::{Quality, range};
 
 /// Settings of the refinement. Rates are those of 3D Gaussian Splatting, which TrackerSplat's released code uses for 1000
 /// steps per frame, raised here for a third of the steps: on both moving clips the held-out PSNR still grew up to these.
@@ -10,28 +10,45 @@ use crate::settings::Quality;
 #[serde(default, deny_unknown_fields)]
 pub struct RefineSettings {
     /// Optimisation steps at most, one view each; 0 leaves the compensated Gaussians as they are.
+    #[serde(deserialize_with = "range::steps")]
     pub iterations: u32,
     /// Whether Gaussians that motion compensation calls static are left out of the optimisation.
     pub freeze_static: bool,
+    /// Share of static Gaussians from which a frame counts as at rest, if its light is unchanged too: then they are left out
+    /// as well, as all that could be learned from such a frame is its noise.
+    #[serde(deserialize_with = "range::unit")]
+    pub rest_share: f32,
+    /// Mean difference of block colours, sRGB 0 to 1, up to which the light counts as unchanged.
+    #[serde(deserialize_with = "range::unit")]
+    pub rest_light: f32,
     /// Weight of the structural term in the loss, 0 to 1.
+    #[serde(deserialize_with = "range::unit")]
     pub dssim_weight: f32,
     /// Rate of the means, in scene extents per step.
+    #[serde(deserialize_with = "range::unit")]
     pub mean_rate: f32,
     /// Rate of the quaternions.
+    #[serde(deserialize_with = "range::unit")]
     pub rotation_rate: f32,
     /// Rate of the log scales.
+    #[serde(deserialize_with = "range::unit")]
     pub log_scale_rate: f32,
     /// Rate of the logit opacities.
+    #[serde(deserialize_with = "range::unit")]
     pub logit_opacity_rate: f32,
     /// Rate of the spherical harmonics of degree 0.
+    #[serde(deserialize_with = "range::unit")]
     pub sh_dc_rate: f32,
     /// Rate of the higher spherical harmonics.
+    #[serde(deserialize_with = "range::unit")]
     pub sh_rest_rate: f32,
     /// Share of every rate that is left at the last step; the rates fall exponentially towards it.
+    #[serde(deserialize_with = "range::unit")]
     pub final_rate_share: f32,
     /// Steps over which the loss is compared with the same number before; 0 never stops early.
     pub plateau_window: u32,
     /// The optimisation stops when the loss fell by less than this share from window to window.
+    #[serde(deserialize_with = "range::unit")]
     pub plateau_improvement: f32,
 }
 
@@ -51,6 +68,8 @@ impl RefineSettings {
                 Quality::Best => 1000,
             },
             freeze_static: false,
+            rest_share: 0.95,
+            rest_light: 0.01,
             dssim_weight: 0.2,
             mean_rate: 8e-4,
             rotation_rate: 8e-3,

@@ -48,7 +48,8 @@ pub(super) fn densify(
 }
 
 fn keeps(gaussians: &Gaussians, index: usize, settings: &StaticModelSettings, extent: f64) -> bool {
-    gaussians.opacity(index) >= f64::from(settings.prune_opacity)
+    gaussians.is_finite(index)
+        && gaussians.opacity(index) >= f64::from(settings.prune_opacity)
         && largest_scale(gaussians, index) <= f64::from(settings.prune_extent) * extent
 }
 

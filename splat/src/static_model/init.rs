@@ -68,7 +68,7 @@ pub(super) fn random_points(cameras: &[&Camera], count: usize, random: &mut ChaC
     let mean_distance =
         cameras.iter().map(|camera| camera.centre().distance(focus)).sum::<f64>() / cameras.len() as f64;
     let enough = cameras.len().div_ceil(2).max(2.min(cameras.len()));
-    let mut points = Vec::with_capacity(count);
+    let mut points = Vec::new();
     // A ball that no two cameras share would never fill; the bound keeps the draw finite.
     for _ in 0..count.saturating_mul(100) {
         if points.len() == count {

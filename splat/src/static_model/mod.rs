@@ -124,6 +124,17 @@ fn initial(
     Ok(init::from_points(&thinned, settings.sh_degree_for(input.views.len())))
 }
 
+/// The Gaussians whose every parameter is a finite number.
+fn finite(gaussians: &Gaussians) -> Result<Gaussians, StaticModelError> {
+    let kept: Vec<usize> = (0..gaussians.len()).filter(|&index| gaussians.is_finite(index)).collect();
+    if kept.is_empty() {
+        return Err(StaticModelError::BadInput(
+            "the optimisation diverged; lower the rates of `static_model`".into(),
+        ));
+    }
+    Ok(gaussians.select(&kept))
+}
+
 struct Optimisation<'a> {
     session: Box<dyn Session>,
     settings: &'a StaticModelSettings,
@@ -139,7 +150,8 @@ impl Optimisation<'_> {
     ) -> Result<Gaussians, StaticModelError> {
         let steps = self.settings.max_steps;
         let grow_until = (self.settings.densify_until * steps as f32) as u32;
-        let mut plateau = Plateau::new(self.settings.plateau_window, self.settings.plateau_improvement);
+        let mut plateau =
+            Plateau::new(self.settings.plateau_window, self.settings.plateau_improvement, self.views);
         let mut epochs = Epochs::new(self.views);
         let mut count = self.session.gaussians()?.len();
         for step in 0..steps {
@@ -160,7 +172,7 @@ impl Optimisation<'_> {
                 break;
             }
         }
-        Ok(self.session.gaussians()?)
+        finite(&self.session.gaussians()?)
     }
 
     fn densify(&mut self, grow: bool) -> Result<usize, StaticModelError> {
