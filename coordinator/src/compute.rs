@@ -31,7 +31,8 @@ impl Compute {
     }
 }
 
-fn panic_message(error: tokio::task::JoinError) -> String {
+/// What a task that panicked said, as the message of a failure.
+pub(crate) fn panic_message(error: tokio::task::JoinError) -> String {
     let Ok(panic) = error.try_into_panic() else { return "the computation was aborted".into() };
     let text = panic.downcast_ref::<String>().map(String::as_str);
     let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message");

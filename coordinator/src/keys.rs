@@ -38,7 +38,7 @@ pub(crate) struct StaticModelKey<'a> {
 pub(crate) struct TrackKey<'a> {
     pub(crate) kind: &'static str,
     pub(crate) version: &'static str,
-    /// Settings of the coordinator's tracker, `exact`, or the digest of an imported file.
+    /// Digest of the tracker's settings or of the imported file.
     pub(crate) source: &'a str,
     pub(crate) clip: &'a str,
     /// Frames from the key frame to this one: tracks are chained through them.

@@ -18,6 +18,13 @@ pub(crate) struct InputFile {
 }
 
 impl InputFile {
+    /// Reads the whole file for its digest.
+    pub(crate) fn read(path: &Path) -> std::io::Result<Self> {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update_reader(std::fs::File::open(path)?)?;
+        Ok(Self { path: path.display().to_string(), digest: hasher.finalize().to_hex().to_string() })
+    }
+
     /// File name without its ending.
     pub(crate) fn stem(&self) -> &str {
         Path::new(&self.path).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default()
@@ -30,7 +37,8 @@ impl InputFile {
 pub(crate) enum TrackSource {
     #[default]
     Own,
-    Exact,
+    /// The clip's own, in order of the training views; none where the job needs no tracks.
+    Exact(Vec<InputFile>),
     Files(Vec<InputFile>),
 }
 
@@ -66,6 +74,9 @@ impl JobRequest {
         let mut request = self.clone();
         let nameless = |file: &mut InputFile| file.path.clear();
         request.static_model.iter_mut().for_each(nameless);
+        if let TrackSource::Exact(files) = &mut request.tracks {
+            files.iter_mut().for_each(nameless);
+        }
         if let TrackSource::Files(files) = &mut request.tracks {
             let by_name = self.track_files_by_name;
             files

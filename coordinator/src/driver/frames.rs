@@ -27,11 +27,10 @@ impl Job {
         for &frame in &self.frames {
             let request = self.frame_job(frame, &base.blob, &views, &tracks).await?;
             let key = frame_key(&request, &self.settings, self.hub.engine.name());
+            let is_done = self.is_done(frame).await?;
             match self.held_artifact(&key).await? {
-                Some(known) if !self.is_done(frame).await? => {
-                    self.reuse(&base, &request, &key, &known).await?
-                }
-                _ => self.hub.publish(&self.id, &request, &key).await?,
+                Some(known) if !is_done => self.reuse(&base, &request, &key, &known).await?,
+                _ => self.hub.publish(&self.id, &self.stop, &request, &key).await?,
             }
             let _ = progress.advance(self.frames.len() as u64);
         }
@@ -47,9 +46,15 @@ impl Job {
         Ok(())
     }
 
+    /// Whether a frame has its result. A result whose bytes are gone is given up.
     async fn is_done(&self, frame: u32) -> Result<bool, StageError> {
         let record = self.hub.store.frame(&self.id, frame).await?;
-        Ok(record.is_some_and(|record| record.delta().is_some()))
+        let Some(delta) = record.and_then(|record| record.delta()) else { return Ok(false) };
+        if self.hub.blobs.holds(&delta).await {
+            return Ok(true);
+        }
+        self.hub.lose_result(&self.id, &self.stop, frame).await?;
+        Ok(false)
     }
 
     /// The static model, decoded: results are verified against it.
@@ -136,7 +141,7 @@ impl Job {
             seconds: 0.0,
             stage_seconds: &BTreeMap::new(),
         };
-        self.hub.reuse(&self.id, request, key, &result).await
+        self.hub.reuse(&self.id, &self.stop, request, key, &result).await
     }
 }
 

@@ -18,15 +18,13 @@ use splat::{
 };
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
+use trackersplat_proto::v1::FailureKind;
 
 use crate::{
     compute::go_on,
-    failure::StageError,
+    failure::{StageError, failure},
     hub::Hub,
-    queue::{
-        JobId,
-        job::{JobState, JobTrigger},
-    },
+    queue::{JobId, job::JobState},
     request::JobRequest,
     store::{JobRecord, StoreError, ViewRecord},
 };
@@ -64,17 +62,19 @@ async fn run_stages(
     frame_ended: Arc<Notify>,
     clip: Option<Arc<Clip>>,
 ) -> Result<(), StoreError> {
-    let ended = match Job::load(hub.clone(), id.clone(), stop, frame_ended, clip).await {
+    let ended = match Job::load(hub.clone(), id.clone(), stop.clone(), frame_ended, clip).await {
         Ok(mut job) => job.run_to_end().await,
         Err(error) => Err(error),
     };
     match ended {
         Ok(()) | Err(StageError::Stopped) => Ok(()),
-        Err(StageError::State(error)) => Err(error),
-        Err(StageError::Failed(failure)) => {
-            hub.end_job(id.clone(), JobTrigger::Fail, Some(failure)).await?;
-            Ok(())
+        // One job's unreadable value is no reason to keep the others waiting.
+        Err(StageError::State(error @ StoreError::Value { .. })) => {
+            let message = format!("{error}; submit the job again with another output folder");
+            hub.fail_run(id, &stop, failure(FailureKind::BadInput, message)).await
         }
+        Err(StageError::State(error)) => Err(error),
+        Err(StageError::Failed(failure)) => hub.fail_run(id, &stop, failure).await,
     }
 }
 
@@ -106,7 +106,7 @@ impl Job {
             let mut change = self.hub.store.change().await?;
             change.add_stage_seconds(&self.id, state.label(), start.elapsed().as_secs_f64()).await?;
             change.commit().await?;
-            state = self.hub.advance(&self.id).await?;
+            state = self.hub.advance(&self.id, &self.stop, state).await?;
         }
         Ok(())
     }

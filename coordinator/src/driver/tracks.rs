@@ -1,6 +1,6 @@
 //! Track fields from the key frame to every frame, per training view: computed, or imported. Once per clip.
 
-use std::{collections::BTreeMap, path::PathBuf, sync::Arc};
+use std::{collections::BTreeMap, path::Path, sync::Arc};
 
 use bytes::Bytes;
 use rayon::prelude::*;
@@ -32,8 +32,8 @@ struct MissingView {
     position: usize,
     name: String,
     size: (u32, u32),
-    /// The file to import; `None`: track.
-    file: Option<PathBuf>,
+    /// The file to import, as submitted; `None`: track.
+    file: Option<InputFile>,
 }
 
 /// An encoded field on its way to the store: position of the view, index of the frame.
@@ -100,17 +100,17 @@ impl Job {
                 settings = digest_of(&self.settings.tracking);
                 settings.as_str()
             }
-            TrackSource::Exact => "exact",
-            TrackSource::Files(_) => self.track_file(position, view)?.digest.as_str(),
+            TrackSource::Exact(_) | TrackSource::Files(_) => self.track_file(position, view)?.digest.as_str(),
         };
         let clip = &self.record.clip_digest;
         let frames = &self.frames[..=index];
         Ok(digest_of(&TrackKey { kind: "tracks", version: VERSION, source, clip, frames, view }))
     }
 
-    /// The imported file of a training view: by name where every file is named after a view, else by order.
+    /// The imported file of a training view: by name where every file is named after a view, else by order, as are those
+    /// of the clip.
     fn track_file(&self, position: usize, view: &str) -> Result<&InputFile, StageError> {
-        let TrackSource::Files(files) = &self.request.tracks else {
+        let (TrackSource::Files(files) | TrackSource::Exact(files)) = &self.request.tracks else {
             return Err(StageError::new(FailureKind::Bug, "the job imports no tracks"));
         };
         let found = match self.request.track_files_by_name {
@@ -135,8 +135,9 @@ impl Job {
         {
             let file = match &self.request.tracks {
                 TrackSource::Own => None,
-                TrackSource::Exact => Some(clip.exact_flow_path(position)),
-                TrackSource::Files(_) => Some(PathBuf::from(&self.track_file(position, &view.name)?.path)),
+                TrackSource::Exact(_) | TrackSource::Files(_) => {
+                    Some(self.track_file(position, &view.name)?.clone())
+                }
             };
             if self.tracks_of(position, &view.name).await?.is_none() {
                 let size = (view.camera.width, view.camera.height);
@@ -175,13 +176,15 @@ struct TrackRun {
 impl TrackRun {
     fn run(&self, view: &MissingView) -> Result<(), StageError> {
         let Some(file) = &view.file else { return self.track(view) };
-        let fields = if *file == self.clip.exact_flow_path(view.position) {
-            let read = track_npz::read_exact_flow(file);
-            let fields = read.map_err(|error| bad_tracks(view, error))?;
-            exact_fields(view, &self.frames, fields)?
-        } else {
-            let fields = track_npz::read_track_npz(file).map_err(|error| bad_tracks(view, error))?;
-            imported_fields(view, self.frames.len(), fields)?
+        let path = Path::new(&file.path);
+        let is_exact = path == self.clip.exact_flow_path(view.position);
+        let read = if is_exact { track_npz::read_exact_flow(path) } else { track_npz::read_track_npz(path) };
+        // After reading: what was read is what is kept under the key of the submitted file.
+        check_unchanged(view, file)?;
+        let fields = read.map_err(|error| bad_tracks(view, error))?;
+        let fields = match is_exact {
+            true => exact_fields(view, &self.frames, fields)?,
+            false => imported_fields(view, self.frames.len(), fields)?,
         };
         for (index, field) in (1..).zip(fields) {
             self.emit(view, index, &field)?;
@@ -209,8 +212,18 @@ impl TrackRun {
     }
 }
 
+fn check_unchanged(view: &MissingView, submitted: &InputFile) -> Result<(), StageError> {
+    let now = InputFile::read(Path::new(&submitted.path));
+    let now = now.map_err(|error| bad_tracks(view, format!("{error}; check the path")))?;
+    if now.digest != submitted.digest {
+        let reason = "the file has changed since the job was submitted; submit the job again";
+        return Err(bad_tracks(view, reason));
+    }
+    Ok(())
+}
+
 fn bad_tracks(view: &MissingView, reason: impl std::fmt::Display) -> StageError {
-    let file = view.file.as_ref().map(|file| file.display().to_string()).unwrap_or_default();
+    let file = view.file.as_ref().map(|file| file.path.as_str()).unwrap_or_default();
     StageError::bad_input(format!("tracks of view '{}' in {file}: {reason}", view.name))
 }
 
@@ -285,7 +298,8 @@ mod tests {
     use super::*;
 
     fn view() -> MissingView {
-        MissingView { position: 0, name: "cam00".into(), size: (2, 1), file: Some("flow/cam00.npz".into()) }
+        let file = InputFile { path: "flow/cam00.npz".into(), digest: String::new() };
+        MissingView { position: 0, name: "cam00".into(), size: (2, 1), file: Some(file) }
     }
 
     fn field(x: f32) -> TrackField {
@@ -303,6 +317,22 @@ mod tests {
         assert_eq!(failure.kind(), FailureKind::BadInput);
         assert!(failure.message.contains("cam00") && failure.message.contains("flow/cam00.npz"));
         failure.message
+    }
+
+    #[test]
+    fn a_track_file_that_has_changed_since_the_submission_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("flow/cam00.npz");
+        std::fs::create_dir(folder.path().join("flow")).unwrap();
+        std::fs::write(&path, b"submitted").unwrap();
+        let submitted = InputFile::read(&path).unwrap();
+        let view = MissingView { file: Some(submitted.clone()), ..view() };
+        check_unchanged(&view, &submitted).unwrap();
+        std::fs::write(&path, b"changed").unwrap();
+        let message = refusal(check_unchanged(&view, &submitted).map(|()| vec![]));
+        assert!(message.contains("has changed"), "{message}");
+        std::fs::remove_file(&path).unwrap();
+        refusal(check_unchanged(&view, &submitted).map(|()| vec![]));
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{Failure, FailureKind, FrameJob};
 
 use super::{Desk, FrameBase, Hub};
@@ -19,6 +20,7 @@ impl Hub {
     pub(crate) async fn publish(
         &self,
         job: &JobId,
+        stop: &CancellationToken,
         request: &FrameJob,
         result_key: &str,
     ) -> Result<(), StageError> {
@@ -26,7 +28,7 @@ impl Hub {
         let mut desk = self.desk.lock().await;
         let known = self.store.frame(job, frame).await?;
         let mut change = self.store.change().await?;
-        if change.job_state(job).await?.has_ended() {
+        if stop.is_cancelled() || change.job_state(job).await?.has_ended() {
             return Err(StageError::Stopped);
         }
         change.publish_frame(request, result_key).await?;
@@ -48,6 +50,7 @@ impl Hub {
     pub(crate) async fn reuse(
         &self,
         job: &JobId,
+        stop: &CancellationToken,
         request: &FrameJob,
         result_key: &str,
         result: &CommittedFrame<'_>,
@@ -56,7 +59,7 @@ impl Hub {
         let mut desk = self.desk.lock().await;
         let known = self.store.frame(job, frame).await?;
         let mut change = self.store.change().await?;
-        if change.job_state(job).await?.has_ended() {
+        if stop.is_cancelled() || change.job_state(job).await?.has_ended() {
             return Err(StageError::Stopped);
         }
         change.publish_frame(request, result_key).await?;
@@ -72,6 +75,29 @@ impl Hub {
         change.commit().await?;
         desk.queue.close_ready(&FrameKey { job: job.clone(), frame });
         tracing::info!(job_id = %job, frame, "frame reused");
+        self.tell_stored(job);
+        Ok(())
+    }
+
+    /// Makes a done frame whose result is gone from the store ready again.
+    pub(crate) async fn lose_result(
+        &self,
+        job: &JobId,
+        stop: &CancellationToken,
+        frame: u32,
+    ) -> Result<(), StageError> {
+        let _desk = self.desk.lock().await;
+        let Some(record) = self.store.frame(job, frame).await? else { return Ok(()) };
+        if stop.is_cancelled() {
+            return Err(StageError::Stopped);
+        }
+        if record.state()?.after(FrameTrigger::Lose).is_err() {
+            return Ok(());
+        }
+        let mut change = self.store.change().await?;
+        change.lose_result(job, frame).await?;
+        change.commit().await?;
+        tracing::warn!(job_id = %job, frame, "the frame's result is gone from the store; it is computed again");
         self.tell_stored(job);
         Ok(())
     }
@@ -176,7 +202,9 @@ impl Desk {
         }
     }
 
-    pub(super) fn base(&self, job: &JobId) -> Option<Arc<FrameBase>> {
-        self.active.get(job)?.base.clone()
+    /// What results of a job's present run are verified against, and its token.
+    pub(super) fn base(&self, job: &JobId) -> Option<(Arc<FrameBase>, CancellationToken)> {
+        let active = self.active.get(job)?;
+        Some((active.base.clone()?, active.stop.clone()))
     }
 }

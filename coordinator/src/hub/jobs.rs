@@ -4,6 +4,7 @@ use std::{path::PathBuf, sync::Arc};
 
 use splat::clip::Clip;
 use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{CancelLease, Dismiss, Failure, coordinator_message::Message};
 
 use super::{ActiveJob, Desk, FrameBase, Hub};
@@ -82,15 +83,24 @@ impl Hub {
         self.desk.lock().await.active.insert(id.clone(), active);
         self.tell_stored(&id);
         let hub = self.clone();
-        self.spawn_driver(driver::run(hub, id, stop, frame_ended, clip));
+        let run = driver::run(hub, id.clone(), stop.clone(), frame_ended, clip);
+        self.spawn_driver(id, stop, run);
     }
 
-    /// The job's stage ended well. `Stopped` if somebody ended the job meanwhile.
-    pub(crate) async fn advance(&self, job: &JobId) -> Result<JobState, StageError> {
+    /// The job's stage `ended` well. `Stopped` if somebody ended the run meanwhile: the job may be another run's by now.
+    pub(crate) async fn advance(
+        &self,
+        job: &JobId,
+        stop: &CancellationToken,
+        ended: JobState,
+    ) -> Result<JobState, StageError> {
         let mut desk = self.desk.lock().await;
         let mut change = self.store.change().await?;
-        let before = change.job_state(job).await?;
-        let Ok(next) = before.after(JobTrigger::StageDone) else { return Err(StageError::Stopped) };
+        // Under the lock, under which runs are stopped.
+        if stop.is_cancelled() || change.job_state(job).await? != ended {
+            return Err(StageError::Stopped);
+        }
+        let Ok(next) = ended.after(JobTrigger::StageDone) else { return Err(StageError::Stopped) };
         change.set_job_state(job, next, None).await?;
         change.append_job_event(job, next, None).await?;
         change.commit().await?;
@@ -102,25 +112,44 @@ impl Hub {
         Ok(next)
     }
 
-    /// Ends a job by cancelling or failing it: its open frames are cancelled, their workers told. Returns its state;
-    /// an ended job stays as it is.
-    pub(crate) async fn end_job(
+    /// Ends a job for a client. Returns its state; an ended job stays as it is.
+    pub(crate) async fn cancel_job(&self, job: &JobId) -> Result<JobState, StoreError> {
+        let mut desk = self.desk.lock().await;
+        self.end_job(&mut desk, job, JobTrigger::Cancel, None).await
+    }
+
+    /// One run of a job has failed. Nothing happens if it was stopped meanwhile: the job may be another run's by now.
+    pub(crate) async fn fail_run(
         &self,
-        job: JobId,
+        job: &JobId,
+        stop: &CancellationToken,
+        failure: Failure,
+    ) -> Result<(), StoreError> {
+        let mut desk = self.desk.lock().await;
+        if !stop.is_cancelled() {
+            self.end_job(&mut desk, job, JobTrigger::Fail, Some(failure)).await?;
+        }
+        Ok(())
+    }
+
+    /// The job's open frames are cancelled, their workers told.
+    async fn end_job(
+        &self,
+        desk: &mut Desk,
+        job: &JobId,
         trigger: JobTrigger,
         failure: Option<Failure>,
     ) -> Result<JobState, StoreError> {
-        let mut desk = self.desk.lock().await;
         let mut change = self.store.change().await?;
-        let before = change.job_state(&job).await?;
+        let before = change.job_state(job).await?;
         let Ok(next) = before.after(trigger) else { return Ok(before) };
-        let leases = desk.queue.cancel_job(&job);
+        let leases = desk.queue.cancel_job(job);
         for lease in &leases {
             change.end_attempt(&lease.id, AttemptOutcome::Cancelled).await?;
         }
-        cancel_open_frames(&mut change, &job, self).await?;
-        change.set_job_state(&job, next, failure.as_ref()).await?;
-        change.append_job_event(&job, next, failure.as_ref()).await?;
+        cancel_open_frames(&mut change, job).await?;
+        change.set_job_state(job, next, failure.as_ref()).await?;
+        change.append_job_event(job, next, failure.as_ref()).await?;
         change.commit().await?;
         let reason = failure.as_ref().map_or("", |failure| failure.message.as_str());
         tracing::info!(job_id = %job, state = next.label(), reason, "job ended");
@@ -128,8 +157,8 @@ impl Hub {
             let reason = format!("the job is {}", next.label());
             desk.send(lease.session, Message::CancelLease(CancelLease { lease_id: lease.id, reason }));
         }
-        self.retire(&mut desk, &job);
-        self.tell_stored(&job);
+        self.retire(desk, job);
+        self.tell_stored(job);
         Ok(next)
     }
 
@@ -171,8 +200,8 @@ impl Hub {
     }
 }
 
-async fn cancel_open_frames(change: &mut Change, job: &JobId, hub: &Hub) -> Result<(), StoreError> {
-    for frame in hub.store.frames(job).await? {
+async fn cancel_open_frames(change: &mut Change, job: &JobId) -> Result<(), StoreError> {
+    for frame in change.frames(job).await? {
         let Ok(next) = frame.state()?.after(FrameTrigger::Cancel) else { continue };
         debug_assert_eq!(next, FrameState::Cancelled);
         change.set_frame_state(job, frame.frame, next).await?;

@@ -21,13 +21,14 @@ use tokio::{
     task::JoinSet,
 };
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{Blob, JobEvent, Progress, WorkersChanged, job_event::Event};
+use trackersplat_proto::v1::{Blob, FailureKind, JobEvent, Progress, WorkersChanged, job_event::Event};
 
 use self::sessions::Session;
 pub(crate) use self::sessions::{OUTGOING_QUEUE, Registered, SharedHub};
 use crate::{
     blobs::BlobStore,
-    compute::Compute,
+    compute::{Compute, panic_message},
+    failure::failure,
     options::ServeOptions,
     queue::{JobId, Queue, QueuePolicy, SessionId},
     store::{Store, StoreError},
@@ -168,8 +169,22 @@ impl Hub {
         self.fatal.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
-    /// Runs a job's driver beside everything else.
-    pub(crate) fn spawn_driver(&self, driver: impl Future<Output = ()> + Send + 'static) {
+    /// Runs a job's driver beside everything else. If it panics, its run fails.
+    pub(crate) fn spawn_driver(
+        self: &Arc<Self>,
+        job: JobId,
+        stop: CancellationToken,
+        driver: impl Future<Output = ()> + Send + 'static,
+    ) {
+        let hub = self.clone();
+        let driver = async move {
+            // A task of its own, so that a panic ends that task only.
+            let Err(error) = tokio::spawn(driver).await else { return };
+            let defect = failure(FailureKind::Bug, panic_message(error));
+            if let Err(error) = hub.fail_run(&job, &stop, defect).await {
+                hub.fail(error);
+            }
+        };
         let mut drivers = self.drivers.lock().unwrap_or_else(PoisonError::into_inner);
         while drivers.try_join_next().is_some() {}
         drivers.spawn(driver);

@@ -12,15 +12,31 @@ use trackersplat_proto::v1::{
 
 use super::{FrameBase, Hub};
 use crate::{
-    assembly,
+    assembly::{self, AssemblyError},
     blobs::BlobError,
     failure::{StageError, failure},
     queue::{Lease, SessionId, Stale},
-    store::{CommittedFrame, StoreError},
+    store::{Artifact, CommittedFrame, StoreError},
 };
 
 /// Longest text that a worker may send: reports hold a few numbers per view.
 const MAX_REPORT_BYTES: usize = 1 << 20;
+
+/// Why a frame's result is not in the output folder.
+#[derive(Debug)]
+pub(crate) enum FrameError {
+    /// The result is at fault: the attempt has failed.
+    Result(Failure),
+    /// The output folder takes no file: no attempt would do better, the job fails.
+    Output(Failure),
+}
+
+impl From<FrameError> for StageError {
+    fn from(error: FrameError) -> Self {
+        let (FrameError::Result(reason) | FrameError::Output(reason)) = error;
+        Self::Failed(reason)
+    }
+}
 
 impl Hub {
     /// A worker reports; it gets a receipt in any case.
@@ -62,6 +78,19 @@ impl Hub {
         }
     }
 
+    /// A result does not count: the attempt has failed.
+    async fn refused(
+        &self,
+        session: SessionId,
+        lease_id: &str,
+        attempt: u32,
+        reason: Failure,
+    ) -> Result<Option<String>, StoreError> {
+        let message = reason.message.clone();
+        let stale = self.failed(session, lease_id, attempt, reason).await?;
+        Ok(Some(stale.unwrap_or(message)))
+    }
+
     /// `None` if the result counts, else why not.
     async fn succeeded(
         &self,
@@ -75,21 +104,25 @@ impl Hub {
             let lease = desk.queue.begin_report(session, lease_id, attempt).cloned();
             lease.map(|lease| (desk.base(&lease.key.job), lease))
         };
-        let (base, lease) = match held {
+        let (run, lease) = match held {
             Ok(held) => held,
             Err(stale) => return self.stale_success(lease_id, attempt, &stale).await,
         };
         let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
-        let verified = match base {
-            Some(base) => self.verify(&lease, base, &success).await,
-            None => Err(failure(FailureKind::Transient, "the job is not ready for results")),
+        let Some((base, stop)) = run else {
+            let reason = failure(FailureKind::Transient, "the job is not ready for results");
+            return self.refused(session, lease_id, attempt, reason).await;
         };
-        let delta = match verified {
+        let delta = match self.verify(&lease, base, &success).await {
             Ok(delta) => delta,
-            Err(reason) => {
+            Err(FrameError::Output(reason)) => {
                 let message = reason.message.clone();
-                let stale = self.failed(session, lease_id, attempt, reason).await?;
-                return Ok(Some(stale.unwrap_or(message)));
+                self.keep_result(&lease, &success).await?;
+                self.fail_run(&lease.key.job, &stop, reason).await?;
+                return Ok(Some(message));
+            }
+            Err(FrameError::Result(reason)) => {
+                return self.refused(session, lease_id, attempt, reason).await;
             }
         };
         let stage_seconds: BTreeMap<String, f64> = success
@@ -131,9 +164,24 @@ impl Hub {
         Ok(Some(stale.to_string()))
     }
 
+    /// Keeps a verified result that the output folder does not take, so that the resubmitted job need not compute it.
+    async fn keep_result(&self, lease: &Lease, success: &Success) -> Result<(), StoreError> {
+        let record = self.store.frame(&lease.key.job, lease.key.frame).await?;
+        let (Some(record), Some(delta)) = (record, &success.delta) else { return Ok(()) };
+        let artifact = Artifact { blob: delta.clone(), note: success.report_json.clone() };
+        let mut change = self.store.change().await?;
+        change.put_artifact(&record.result_key, "frame", &artifact).await?;
+        change.commit().await
+    }
+
     /// The delta exists, is what its name says, fits the static model and is finite; then the frame's file is written.
-    async fn verify(&self, lease: &Lease, base: Arc<FrameBase>, success: &Success) -> Result<Blob, Failure> {
-        let bug = |message: String| failure(FailureKind::Bug, message);
+    async fn verify(
+        &self,
+        lease: &Lease,
+        base: Arc<FrameBase>,
+        success: &Success,
+    ) -> Result<Blob, FrameError> {
+        let bug = |message: String| FrameError::Result(failure(FailureKind::Bug, message));
         let delta = success.delta.clone().ok_or_else(|| bug("the worker's result names no delta".into()))?;
         check_report(&success.report_json).map_err(bug)?;
         let bytes = self.blobs.get(&delta).await.map_err(|error| {
@@ -143,14 +191,9 @@ impl Hub {
                     FailureKind::Transient
                 }
             };
-            failure(kind, format!("the worker's delta: {error}"))
+            FrameError::Result(failure(kind, format!("the worker's delta: {error}")))
         })?;
-        let frame = lease.key.frame;
-        self.write_frame(base, frame, bytes).await.map_err(|error| match error {
-            StageError::Failed(reason) => reason,
-            StageError::Stopped => failure(FailureKind::Transient, "the coordinator shuts down"),
-            StageError::State(error) => failure(FailureKind::Transient, error.to_string()),
-        })?;
+        self.write_frame(base, lease.key.frame, bytes).await?;
         Ok(delta)
     }
 
@@ -160,20 +203,28 @@ impl Hub {
         base: Arc<FrameBase>,
         frame: u32,
         bytes: bytes::Bytes,
-    ) -> Result<(), StageError> {
+    ) -> Result<(), FrameError> {
         let work = move || {
-            let bug = |message: String| StageError::new(FailureKind::Bug, message);
+            let bug = |message: String| FrameError::Result(failure(FailureKind::Bug, message));
             let gaussians = delta::apply(&base.model, &base.digest, &bytes).map_err(|error| {
                 bug(format!("the delta of frame {frame} does not fit the static model: {error}"))
             })?;
             validate::validate(&gaussians)
                 .map_err(|error| bug(format!("the Gaussians of frame {frame} are not valid: {error}")))?;
-            assembly::write_frame(&base.output, frame, &base.model, &base.blob.digest, &bytes)
-                .map_err(|error| StageError::new(FailureKind::Transient, error.to_string()))
+            assembly::write_frame(&base.output, frame, &base.model, &base.blob.digest, &bytes).map_err(
+                |error| match error {
+                    AssemblyError::Io { .. } => FrameError::Output(failure(
+                        FailureKind::Transient,
+                        format!("{error}; the same command then goes on with what is computed"),
+                    )),
+                    error => bug(error.to_string()),
+                },
+            )
         };
         let ended = tokio::task::spawn_blocking(work).await;
         ended.unwrap_or_else(|error| {
-            Err(StageError::new(FailureKind::Bug, format!("reading the delta of frame {frame}: {error}")))
+            let message = format!("reading the delta of frame {frame}: {error}");
+            Err(FrameError::Result(failure(FailureKind::Bug, message)))
         })
     }
 }

@@ -34,6 +34,8 @@ pub enum FrameTrigger {
     Cancel,
     /// The ended job was submitted again.
     Resubmit,
+    /// The bytes of its result are gone from the store.
+    Lose,
 }
 
 /// A transition that the table does not have.
@@ -52,14 +54,14 @@ impl FrameState {
 
     /// The state after a trigger.
     pub fn after(self, trigger: FrameTrigger) -> Result<Self, IllegalFrameTransition> {
-        use FrameTrigger::{Cancel, Commit, GiveUp, Lease, Release, Resubmit, Retry};
+        use FrameTrigger::{Cancel, Commit, GiveUp, Lease, Lose, Release, Resubmit, Retry};
         match (self, trigger) {
             (Self::Ready, Lease) => Ok(Self::Leased),
             (Self::Ready | Self::Leased, Commit) => Ok(Self::Done),
             (Self::Leased, Retry | Release) => Ok(Self::Ready),
             (Self::Ready | Self::Leased, GiveUp) => Ok(Self::Failed),
             (Self::Ready | Self::Leased, Cancel) => Ok(Self::Cancelled),
-            (Self::Failed | Self::Cancelled, Resubmit) => Ok(Self::Ready),
+            (Self::Failed | Self::Cancelled, Resubmit) | (Self::Done, Lose) => Ok(Self::Ready),
             (state, trigger) => Err(IllegalFrameTransition { state, trigger }),
         }
     }
@@ -117,9 +119,10 @@ mod tests {
             (Leased, Cancel, Cancelled),
             (Failed, Resubmit, Ready),
             (Cancelled, Resubmit, Ready),
+            (Done, Lose, Ready),
         ];
         for state in FrameState::ALL {
-            for trigger in [Lease, Commit, Retry, GiveUp, Release, Cancel, Resubmit] {
+            for trigger in [Lease, Commit, Retry, GiveUp, Release, Cancel, Resubmit, Lose] {
                 let listed = legal.iter().find(|row| row.0 == state && row.1 == trigger).map(|row| row.2);
                 match state.after(trigger) {
                     Ok(next) => assert_eq!(Some(next), listed, "{state:?} {trigger:?}"),

@@ -10,7 +10,6 @@ use trackersplat_proto::v1::{
 use super::{fetch, state_failed, submit, uninterrupted, unknown_job, watch};
 use crate::{
     hub::SharedHub,
-    queue::job::JobTrigger,
     store::{JobRecord, StoreError, Summary},
 };
 
@@ -66,7 +65,7 @@ impl Jobs for JobService {
         self.job(&id).await?;
         let hub = self.hub.clone();
         let cancel = async move {
-            let state = hub.end_job(id.into(), JobTrigger::Cancel, None).await;
+            let state = hub.cancel_job(&id.into()).await;
             state.map_err(|error| state_failed(&hub, error))
         };
         let state = uninterrupted(cancel).await?;

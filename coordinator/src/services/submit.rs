@@ -7,7 +7,7 @@ use std::{
 
 use splat::{
     clip::{Clip, Split},
-    settings::Settings,
+    settings::{MotionSource, Settings},
 };
 use tonic::Status;
 use trackersplat_proto::v1::{SubmitRequest, SubmitResponse, submit_request::Tracks};
@@ -141,6 +141,13 @@ fn read(request: SubmitRequest, scratch: PathBuf) -> Result<Submission, Status> 
     if let TrackSource::Files(files) = &job_request.tracks {
         job_request.track_files_by_name = files.iter().all(|file| names.contains(&file.stem()));
     }
+    let needs_tracks = settings.motion_source != MotionSource::None && clip.frames().len() > 1;
+    if let TrackSource::Exact(files) = &mut job_request.tracks
+        && needs_tracks
+    {
+        let flow = positions.iter().map(|&position| clip.exact_flow_path(position));
+        *files = flow.map(|path| read_file("exact tracks", &path)).collect::<Result<_, _>>()?;
+    }
     job_request.training_positions = positions;
     let clip_digest = clip.digest().map_err(bad_clip)?;
     let output_request = match request.output.as_str() {
@@ -181,7 +188,7 @@ fn read_frames(first: u32, last: u32) -> Result<Option<(u32, u32)>, Status> {
 fn read_tracks(tracks: Option<Tracks>) -> Result<TrackSource, Status> {
     match tracks {
         None => Ok(TrackSource::Own),
-        Some(Tracks::ExactTracks(_)) => Ok(TrackSource::Exact),
+        Some(Tracks::ExactTracks(_)) => Ok(TrackSource::Exact(Vec::new())),
         Some(Tracks::TrackFiles(files)) if files.paths.is_empty() => {
             Err(Status::invalid_argument("track_files names no file; give one npz per training view"))
         }
@@ -193,16 +200,16 @@ fn read_tracks(tracks: Option<Tracks>) -> Result<TrackSource, Status> {
 }
 
 fn input_file(what: &str, path: &str) -> Result<InputFile, Status> {
-    let path = local_path(what, path)?;
-    let mut hasher = blake3::Hasher::new();
-    let read = std::fs::File::open(&path).and_then(|file| hasher.update_reader(file).map(|_| ()));
-    read.map_err(|error| {
+    read_file(what, &local_path(what, path)?)
+}
+
+fn read_file(what: &str, path: &Path) -> Result<InputFile, Status> {
+    InputFile::read(path).map_err(|error| {
         Status::invalid_argument(format!(
             "{what} {}: {error}; check that the file is there and may be read",
             path.display()
         ))
-    })?;
-    Ok(InputFile { path: path.display().to_string(), digest: hasher.finalize().to_hex().to_string() })
+    })
 }
 
 /// An absolute path from a path or a `file://` URL.

@@ -1,7 +1,8 @@
 //! The `Workers` service: one stream per worker.
 
-use std::time::Duration;
+use std::{panic::AssertUnwindSafe, time::Duration};
 
+use futures::FutureExt;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
@@ -81,9 +82,13 @@ impl WorkerStream {
 
     async fn register_and_converse(&mut self, register: &Register) -> Result<Option<Status>, StoreError> {
         let Registered { session, close } = self.hub.register(register, self.outgoing.clone()).await?;
-        let ended = self.converse(session, &close).await;
+        // Nothing of the conversation is used after a panic.
+        let ended = AssertUnwindSafe(self.converse(session, &close)).catch_unwind().await;
         self.hub.disconnected(session).await?;
-        ended
+        ended.unwrap_or_else(|_| {
+            tracing::error!(worker_id = register.worker_id, "the worker's stream panicked");
+            Ok(Some(Status::internal("the coordinator has a defect; its log says which. Connect again")))
+        })
     }
 
     /// Handles a worker's messages until its stream ends. A status if it is this side that ends it.

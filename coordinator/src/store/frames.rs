@@ -117,6 +117,9 @@ impl FrameRecord {
     }
 }
 
+/// Every frame of a job, in order.
+const FRAMES: &str = "SELECT * FROM frames WHERE job_id = ? ORDER BY frame";
+
 impl Store {
     /// The views of a job, in order.
     pub async fn views(&self, job: &str) -> Result<Vec<ViewRecord>, StoreError> {
@@ -147,8 +150,7 @@ impl Store {
 
     /// Every frame of a job that was published, in order.
     pub async fn frames(&self, job: &str) -> Result<Vec<FrameRecord>, StoreError> {
-        let query = sqlx::query_as("SELECT * FROM frames WHERE job_id = ? ORDER BY frame").bind(job);
-        Ok(query.fetch_all(&self.pool).await?)
+        Ok(sqlx::query_as(FRAMES).bind(job).fetch_all(&self.pool).await?)
     }
 
     /// One frame.
@@ -192,6 +194,11 @@ impl Change {
             query.bind(view.held_out).bind(camera).execute(&mut *self.transaction).await?;
         }
         Ok(())
+    }
+
+    /// Every frame of a job that was published, in order, inside this change.
+    pub async fn frames(&mut self, job: &str) -> Result<Vec<FrameRecord>, StoreError> {
+        Ok(sqlx::query_as(FRAMES).bind(job).fetch_all(&mut *self.transaction).await?)
     }
 
     /// Records the stored files of one frame.
@@ -311,6 +318,15 @@ impl Change {
                    changed_at = strftime('%Y-%m-%dT%H:%M:%fZ', 'now') \
                    WHERE job_id = ? AND state IN ('failed', 'cancelled') RETURNING frame";
         Ok(sqlx::query_scalar(sql).bind(job).fetch_all(&mut *self.transaction).await?)
+    }
+
+    /// The result of a frame is gone: it is ready again, with all its attempts.
+    pub async fn lose_result(&mut self, job: &str, frame: u32) -> Result<(), StoreError> {
+        self.set_frame_state(job, frame, FrameState::Ready).await?;
+        let sql = "UPDATE frames SET failures = 0, excluded = '[]', delta_digest = '', delta_size = 0, report = '', \
+                   seconds = 0, stage_seconds = '{}' WHERE job_id = ? AND frame = ?";
+        sqlx::query(sql).bind(job).bind(frame).execute(&mut *self.transaction).await?;
+        self.append_ready_event(job, frame).await
     }
 
     /// Leases of a coordinator that is gone: `(job, frame, attempt, lease, worker)`.

@@ -33,7 +33,7 @@ pub(super) async fn within<T>(future: impl Future<Output = T>) -> T {
 }
 
 /// Renders nothing but background; jobs in these tests import their static model.
-struct BackgroundEngine;
+pub(super) struct BackgroundEngine;
 
 impl Engine for BackgroundEngine {
     fn name(&self) -> &str {

@@ -262,13 +262,13 @@ async fn tracks_lead_from_the_key_frame_to_every_other_frame_of_the_training_vie
 }
 
 #[tokio::test]
-async fn exact_tracks_that_the_clip_lacks_fail_the_job_and_name_the_file() {
+async fn exact_tracks_that_the_clip_lacks_are_refused_by_file_name() {
     let bench = Bench::start().await;
     let tracks = trackersplat_proto::v1::submit_request::Tracks::ExactTracks(Default::default());
     let request = SubmitRequest { settings_json: String::new(), tracks: Some(tracks), ..bench.request() };
-    let job = bench.submit(request).await.unwrap().job_id;
-    let (state, failure) = bench.ended(&job).await;
-    let failure = failure.unwrap();
-    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::BadInput));
-    assert!(failure.message.contains("flow/cam"), "{}", failure.message);
+    let status = bench.submit(request.clone()).await.unwrap_err();
+    assert_eq!(status.code(), Code::InvalidArgument);
+    assert!(status.message().contains("flow/cam00.npz"), "{status}");
+    let untracked = SubmitRequest { settings_json: bench.request().settings_json, ..request };
+    bench.submit(untracked).await.expect("a job without motion needs no tracks");
 }

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use tonic::Code;
 use trackersplat_proto::v1::{
-    Blob, FailureKind, FrameState, GoingAway, Heartbeat, JobState, Register, Success, coordinator_message,
-    job_event::Event, report::Outcome, worker_message,
+    Blob, FailureKind, FrameState, GoingAway, Heartbeat, JobState, Register, Report, Success,
+    coordinator_message, job_event::Event, report::Outcome, worker_message,
 };
 
 use super::harness::*;
@@ -158,6 +158,38 @@ async fn bad_results_are_refused_and_three_of_them_fail_the_frame_and_the_job() 
     let failure = failure.unwrap();
     assert_eq!(state, JobState::Failed);
     assert!(failure.message.contains("1 of 3 frames failed: [1]"), "{}", failure.message);
+}
+
+#[tokio::test]
+async fn an_output_folder_that_takes_no_file_fails_the_job_and_costs_no_result() {
+    let bench = Bench::start().await;
+    let job = bench.submitted().await;
+    let mut worker = bench.worker("w").await;
+    let lease = worker.lease().await;
+    let success = bench.result(&lease).await;
+    // Nothing can be made below a file, not even by root.
+    let blocked = bench.folder.path().join("out/deltas");
+    std::fs::write(&blocked, b"").unwrap();
+    let report =
+        Report { lease_id: lease.lease_id, attempt: lease.attempt, outcome: Some(Outcome::Success(success)) };
+    worker.send(worker_message::Message::Report(report)).await;
+    let (state, failure) = bench.ended(&job).await;
+    let failure = failure.unwrap();
+    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::Transient));
+    assert!(
+        failure.message.contains("out/deltas") && failure.message.contains("same command"),
+        "{failure:?}"
+    );
+    assert!(matches!(worker.receive().await.unwrap(), coordinator_message::Message::CancelLease(_)));
+    match worker.receive().await.unwrap() {
+        coordinator_message::Message::Receipt(receipt) => assert!(!receipt.accepted),
+        other => panic!("{other:?}"),
+    }
+
+    std::fs::remove_file(&blocked).unwrap();
+    assert!(bench.submit(bench.request()).await.unwrap().resumed);
+    assert_eq!([worker.work_once(&bench).await, worker.work_once(&bench).await], [2, 3], "frame 1 is kept");
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
 }
 
 #[tokio::test]

@@ -4,4 +4,5 @@ mod harness;
 mod jobs;
 mod leases;
 mod restart;
+mod runs;
 mod transfers;

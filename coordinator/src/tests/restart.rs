@@ -1,6 +1,6 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 
-use trackersplat_proto::v1::{FrameState, JobState, job_event::Event, report::Outcome};
+use trackersplat_proto::v1::{FailureKind, FrameState, JobState, job_event::Event, report::Outcome};
 
 use super::harness::*;
 
@@ -90,4 +90,60 @@ async fn a_second_coordinator_on_the_same_folder_is_refused_until_the_first_has_
     assert!(matches!(refused, crate::ServeError::InUse { .. }), "{refused}");
     bench.stop().await;
     bench.restart().await;
+}
+
+#[tokio::test]
+async fn a_job_with_unreadable_settings_fails_alone() {
+    let mut bench = Bench::start().await;
+    bench.stop().await;
+    let store = crate::store::Store::open(&bench.options.root.join("state.sqlite")).await.unwrap();
+    let job = crate::store::NewJob {
+        id: "a".into(),
+        clip: bench.path("clip"),
+        clip_digest: "c".into(),
+        output: bench.path("unreadable"),
+        output_request: bench.path("unreadable"),
+        settings: r#"{"of another version": 1}"#.into(),
+        settings_digest: "s".into(),
+        request: "{}".into(),
+        frame_numbers: "[1]".into(),
+    };
+    let mut change = store.change().await.unwrap();
+    change.insert_job(&job).await.unwrap();
+    change.commit().await.unwrap();
+    store.close().await;
+
+    bench.restart().await;
+    let (state, failure) = bench.ended("a").await;
+    let failure = failure.unwrap();
+    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::BadInput));
+    assert!(failure.message.contains("jobs.settings"), "{}", failure.message);
+    let job = bench.submitted().await;
+    let mut worker = bench.worker("w").await;
+    for _ in 0..3 {
+        worker.work_once(&bench).await;
+    }
+    assert_eq!(bench.ended(&job).await.0, JobState::Done, "the coordinator goes on");
+}
+
+#[tokio::test]
+async fn a_result_that_is_gone_from_the_store_is_computed_again() {
+    let bench = Bench::start().await;
+    let job = bench.submitted().await;
+    let mut worker = bench.worker("w").await;
+    let lease = worker.lease().await;
+    let success = bench.result(&lease).await;
+    let lost = success.delta.clone().unwrap().digest;
+    assert!(worker.report(&lease, Outcome::Success(success)).await.accepted);
+    for _ in 0..2 {
+        worker.work_once(&bench).await;
+    }
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
+
+    std::fs::remove_file(bench.options.root.join("blobs").join(&lost[..2]).join(&lost)).unwrap();
+    std::fs::remove_dir_all(bench.folder.path().join("out")).unwrap();
+    assert!(bench.submit(bench.request()).await.unwrap().resumed);
+    assert_eq!(worker.work_once(&bench).await, 1);
+    assert_eq!(bench.ended(&job).await.0, JobState::Done, "the other frames stayed done");
+    assert!(bench.folder.path().join("out/frames/frame_0001.ply").exists());
 }

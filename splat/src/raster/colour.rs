@@ -27,7 +27,9 @@ pub(super) fn seen_from(gaussians: &Gaussians, index: usize, centre: DVec3, sh_d
     let (direction, _) = direction_to(gaussians, index, centre);
     let degree = sh_degree.min(gaussians.sh_degree);
     let basis = basis(direction.as_vec3().to_array(), degree);
-    unclamped(gaussians.sh_of(index), &basis, sh::coefficients(degree)).map(|value| value.max(0.0))
+    let colour = unclamped(gaussians.sh_of(index), &basis, sh::coefficients(degree));
+    // Not `max`: a colour that is no number must stay one, so that projection drops the Gaussian.
+    colour.map(|value| if value < 0.0 { 0.0 } else { value })
 }
 
 /// Adds the gradient by the coefficients to `sh_gradient` (`K × 3`) and returns the gradient by the mean.
