@@ -19,6 +19,8 @@ pub(crate) fn run(arguments: &[&str]) -> Result<()> {
 
 /// Runs every test of the workspace and closes with the sums.
 pub(crate) fn test() -> Result<()> {
+    // The end-to-end tests run the program itself.
+    run(&["build", "--package", "trackersplat"])?;
     let arguments = ["test", "--workspace", "--no-fail-fast"];
     announce(&arguments);
     let mut child = cargo().args(arguments).stdout(Stdio::piped()).spawn().context("cannot start cargo")?;
