@@ -117,7 +117,7 @@ fn a_pose_that_is_no_number() {
 
 #[test]
 fn fewer_than_two_training_views() {
-    Scratch::new().refuses(&["--test-views", "cam00,cam01,cam02"], &["training view"]);
+    Scratch::new().refuses(&["--test-views", "cam00,cam01,cam02"], &["views are for training, at least two"]);
 }
 
 #[test]

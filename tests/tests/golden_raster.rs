@@ -1,4 +1,9 @@
 //! The rasterizer and its gradients against dense float64 references.
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "tests; `--nocapture` shows the errors that were found"
+)]
 
 use splat::{
     raster::{render, render_backward},
