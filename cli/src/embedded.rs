@@ -5,8 +5,9 @@ use std::{net::SocketAddr, path::Path, sync::Arc, time::Duration};
 use splat::raster::CpuEngine;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
 use trackersplat_coordinator::{Running, ServeOptions, serve};
-use trackersplat_proto::v1::SubmitRequest;
+use trackersplat_proto::v1::{JobState, ListRequest, SubmitRequest, jobs_client::JobsClient};
 
 use crate::{
     client, display,
@@ -14,11 +15,12 @@ use crate::{
     follow::follow,
     logs::LogArgs,
     outcome::Outcome,
+    output_owner,
     worker_processes::{EndedWorker, WorkerProcesses},
 };
 
 /// Folder of the embedded coordinator's state inside the output folder.
-const STATE_FOLDER: &str = ".trackersplat";
+pub(crate) const STATE_FOLDER: &str = ".trackersplat";
 /// How long dismissed workers may take to end.
 const FAREWELL: Duration = Duration::from_secs(3);
 
@@ -35,6 +37,7 @@ pub(crate) struct EmbeddedRun<'a> {
 impl EmbeddedRun<'_> {
     /// Runs the job to its end. An interruption leaves a folder that the same run resumes.
     pub(crate) async fn run(self, interrupted: &CancellationToken) -> Result<Outcome, CliError> {
+        output_owner::check(self.output, &self.request)?;
         let state = self.output.join(STATE_FOLDER);
         std::fs::create_dir_all(&state).map_err(|error| {
             CliError::bad_input(
@@ -45,15 +48,26 @@ impl EmbeddedRun<'_> {
         let shutdown = CancellationToken::new();
         let coordinator = self.serve(&state, &shutdown).await?;
         let address = format!("http://{}", coordinator.address);
-        let worked = self.work(&state, &address, interrupted).await;
-        shutdown.cancel();
-        // Only now: a worker that dies under a live coordinator would count as lost.
-        let ended = coordinator.finished().await;
+        let stop = interrupted.child_token();
+        let working = async {
+            let worked = self.work(&state, &address, &stop).await;
+            shutdown.cancel();
+            worked
+        };
+        // A coordinator that fails ends before the work, which would look for it in vain.
+        let serving = async {
+            let ended = coordinator.finished().await;
+            stop.cancel();
+            ended
+        };
+        let (worked, ended) = tokio::join!(working, serving);
+        // Its error is the cause of whatever the work met.
+        ended?;
         let (outcome, workers) = worked?;
+        // Only now: a worker that dies under a live coordinator would count as lost.
         if let Some(workers) = workers {
             workers.end(FAREWELL).await;
         }
-        ended?;
         outcome.ok_or_else(|| CliError::Interrupted("interrupted; finished frames are kept".to_owned()))
     }
 
@@ -71,12 +85,12 @@ impl EmbeddedRun<'_> {
         &self,
         state: &Path,
         address: &str,
-        interrupted: &CancellationToken,
+        stop: &CancellationToken,
     ) -> Result<(Option<Outcome>, Option<WorkerProcesses>), CliError> {
         let mut client = client::connect(address).await?;
         // Before any worker starts, so that bad input is refused at once.
         let submitting = client.submit(self.request.clone());
-        let Some(submitted) = interrupted.run_until_cancelled(submitting).await else {
+        let Some(submitted) = stop.run_until_cancelled(submitting).await else {
             return Ok((None, None));
         };
         let submitted = submitted?.into_inner();
@@ -87,10 +101,11 @@ impl EmbeddedRun<'_> {
             if submitted.resumed { "goes on" } else { "started" },
             self.output.display()
         );
-        let mut workers = WorkerProcesses::start(self.workers, address, state)?;
+        let count = if is_done(&mut client, &submitted.job_id).await? { 0 } else { self.workers };
+        let mut workers = WorkerProcesses::start(count, address, state)?;
         let mut display = display::choose(self.logs, address);
         let (notes, mut noted) = mpsc::unbounded_channel();
-        let following = follow(&mut client, &submitted.job_id, 0, display.as_mut(), &mut noted, interrupted);
+        let following = follow(&mut client, &submitted.job_id, 0, display.as_mut(), &mut noted, stop);
         let outcome = {
             tokio::pin!(following);
             loop {
@@ -106,6 +121,12 @@ impl EmbeddedRun<'_> {
         display.finish();
         Ok((outcome?, Some(workers)))
     }
+}
+
+/// Whether a job has nothing left to compute.
+async fn is_done(client: &mut JobsClient<Channel>, job_id: &str) -> Result<bool, CliError> {
+    let jobs = client.list(ListRequest {}).await?.into_inner().jobs;
+    Ok(jobs.iter().any(|job| job.job_id == job_id && job.state() == JobState::Done))
 }
 
 /// What to say of a worker that ended while the job runs; the coordinator says how many frames wait.

@@ -13,6 +13,9 @@ mod interrupt;
 mod layers;
 mod logs;
 mod outcome;
+mod output_owner;
+mod scratch;
+mod stdout;
 mod table;
 mod worker_processes;
 

@@ -53,7 +53,13 @@ impl Blobs {
         if let Some(directory) = open_directory(welcome).await {
             return directory;
         }
-        tracing::info!("the store's directory is not visible here: bulk goes through the coordinator");
+        tracing::info!("the store's directory is not visible here");
+        Self::through_coordinator(channel)
+    }
+
+    /// Streams through the coordinator, whatever is visible here.
+    pub(crate) fn through_coordinator(channel: Channel) -> Self {
+        tracing::info!("bulk goes through the coordinator");
         Self::Coordinator(BlobsClient::new(channel))
     }
 

@@ -54,6 +54,8 @@ pub struct WorkerOptions {
     pub state_dir: Option<PathBuf>,
     /// How long the coordinator may be away before the worker gives up.
     pub reconnect_for: Duration,
+    /// Whether bulk always goes through the coordinator, even where its store's directory is visible.
+    pub remote_blobs: bool,
 }
 
 /// Why a worker ended well.
@@ -114,8 +116,12 @@ pub enum WorkerError {
 
 /// Works for a coordinator until it is dismissed, shut down, or given up on.
 ///
-/// A broken stream is opened again for up to [`WorkerOptions::reconnect_for`]; the running frame goes on meanwhile
-/// and is reported afterwards. Needs a tokio runtime with timers and I/O.
+/// A broken stream is opened again for up to [`WorkerOptions::reconnect_for`]; the running frame goes on meanwhile.
+/// Whether its result counts is the coordinator's to say. It voids a lease as soon as it sees the stream break or the
+/// worker register again, and when it restarts: it then cancels the frame at the next heartbeat, or answers the report
+/// with a receipt that is not accepted, and gives the frame out again. Only a report that was accepted before, and
+/// comes again because its receipt was lost, is acknowledged over the new stream. Either way the worker asks for the
+/// next frame. Needs a tokio runtime with timers and I/O.
 pub async fn run(
     options: WorkerOptions,
     engine: Arc<dyn Engine>,
@@ -240,7 +246,11 @@ impl Worker {
 
     /// Works over one stream until it breaks or the worker's work is over.
     async fn serve(&mut self, mut connection: Connection) -> Result<Exit, ConnectionError> {
-        let blobs = Blobs::open(&connection.welcome, self.channel.clone()).await;
+        let blobs = if self.options.remote_blobs {
+            Blobs::through_coordinator(self.channel.clone())
+        } else {
+            Blobs::open(&connection.welcome, self.channel.clone()).await
+        };
         let period = heartbeat_period(connection.welcome.heartbeat_interval_ms);
         let mut heartbeat = interval(period);
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);

@@ -30,6 +30,7 @@ fn options(coordinator: &TestCoordinator) -> WorkerOptions {
         worker_id: Some("worker-a".into()),
         state_dir: None,
         reconnect_for: Duration::from_secs(15),
+        remote_blobs: false,
     }
 }
 
@@ -145,7 +146,7 @@ async fn a_report_is_repeated_until_it_is_acknowledged() {
 }
 
 #[tokio::test]
-async fn a_running_frame_survives_a_lost_connection() {
+async fn a_running_frame_goes_on_over_a_lost_stream_until_the_coordinator_decides() {
     let coordinator = TestCoordinator::start().await;
     let (reconstruct, started, release) = steps_until_released();
     let (worker, _shutdown) = start(&coordinator, reconstruct);
@@ -166,6 +167,9 @@ async fn a_running_frame_survives_a_lost_connection() {
     release.send(()).unwrap();
     let report = session.wait_for_report().await;
     assert_eq!(report.lease_id, "lease-1");
+    // As the real coordinator does: the lease was void since the stream broke.
+    session.refuse(&report, "stale").await;
+    session.wait_for_lease_request().await;
     dismiss(&session).await;
     assert_eq!(worker.await.unwrap().unwrap(), Exit::Dismissed);
 }
@@ -312,6 +316,7 @@ async fn a_worker_without_a_coordinator_gives_up_after_its_patience() {
         worker_id: None,
         state_dir: None,
         reconnect_for: Duration::from_millis(300),
+        remote_blobs: false,
     };
     let (worker, _shutdown) = start_with(options, shift());
     let error = worker.await.unwrap().unwrap_err();

@@ -126,8 +126,16 @@ impl Session {
     }
 
     pub(crate) async fn acknowledge(&self, report: &Report) {
+        self.send_receipt(report, true, "").await;
+    }
+
+    pub(crate) async fn refuse(&self, report: &Report, reason: &str) {
+        self.send_receipt(report, false, reason).await;
+    }
+
+    async fn send_receipt(&self, report: &Report, accepted: bool, reason: &str) {
         let receipt =
-            v1::ReportReceipt { lease_id: report.lease_id.clone(), accepted: true, reason: String::new() };
+            v1::ReportReceipt { lease_id: report.lease_id.clone(), accepted, reason: reason.to_owned() };
         self.send(coordinator_message::Message::Receipt(receipt)).await;
     }
 

@@ -3,7 +3,7 @@
 use clap::Args;
 use trackersplat_proto::v1::CancelRequest;
 
-use crate::{args::CoordinatorArgs, client, error::CliError, outcome::job_state_label};
+use crate::{args::CoordinatorArgs, client, error::CliError, outcome::job_state_label, stdout};
 
 /// Arguments of `cancel`.
 #[derive(Args, Debug)]
@@ -18,6 +18,6 @@ pub(crate) struct CancelArgs {
 pub(super) async fn run(args: CancelArgs) -> Result<(), CliError> {
     let mut client = client::connect(&args.coordinator.coordinator).await?;
     let cancelled = client.cancel(CancelRequest { job_id: args.job }).await?.into_inner();
-    println!("{}", job_state_label(cancelled.state()));
+    stdout::line(job_state_label(cancelled.state()));
     Ok(())
 }

@@ -7,7 +7,7 @@ use splat::raster::CpuEngine;
 use trackersplat_coordinator::{ServeOptions, serve};
 
 use super::cores;
-use crate::{error::CliError, interrupt};
+use crate::{error::CliError, interrupt, stdout};
 
 /// Arguments of `coordinator`.
 #[derive(Args, Debug)]
@@ -50,7 +50,7 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
     };
     let running = serve(options, Arc::new(CpuEngine), interrupted).await?;
     // For scripts that let the system choose the port.
-    println!("http://{}", running.address);
+    stdout::line(format_args!("http://{}", running.address));
     Ok(running.finished().await?)
 }
 

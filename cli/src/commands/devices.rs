@@ -5,7 +5,7 @@ use serde::Serialize;
 use splat::{engine::Engine, raster::CpuEngine};
 
 use super::{cores, print_json};
-use crate::error::CliError;
+use crate::{error::CliError, stdout};
 
 /// Arguments of `devices`.
 #[derive(Args, Debug)]
@@ -30,7 +30,7 @@ pub(super) fn run(args: DevicesArgs) -> Result<(), CliError> {
         return print_json(&devices);
     }
     for Device { engine, name, threads, features } in &devices {
-        println!("{engine}  {name}, {threads} threads ({})", features.join(", "));
+        stdout::line(format_args!("{engine}  {name}, {threads} threads ({})", features.join(", ")));
     }
     Ok(())
 }

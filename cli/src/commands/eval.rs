@@ -15,7 +15,13 @@ use splat::{
 use trackersplat_coordinator::assembly::sequence::{Sequence, SequenceFrame};
 
 use super::print_json;
-use crate::{error::CliError, outcome, table};
+use crate::{
+    embedded::STATE_FOLDER,
+    error::CliError,
+    outcome,
+    scratch::{self, OpenedClip},
+    stdout, table,
+};
 
 /// Arguments of `eval`.
 #[derive(Args, Debug)]
@@ -42,10 +48,10 @@ struct Measured {
 
 pub(super) fn run(args: EvalArgs) -> Result<(), CliError> {
     let sequence = read_sequence(&args.dir)?;
-    let clip = open_clip(&sequence, args.clip.as_deref())?;
+    let clip = open_clip(&args.dir, &sequence, args.clip.as_deref())?;
     let mut measured = Vec::new();
     for frame in sequence.frames.iter().filter(|frame| frame.is_done()) {
-        measured.push(measure(&args.dir, &sequence, frame, &clip)?);
+        measured.push(measure(&args.dir, &sequence, frame, &clip.clip)?);
     }
     if args.json {
         return print_json(&measured);
@@ -74,7 +80,9 @@ pub(super) fn read_frame(
 }
 
 /// The clip that the sequence was made from, with the same held-out views.
-fn open_clip(sequence: &Sequence, elsewhere: Option<&Path>) -> Result<Clip, CliError> {
+///
+/// Videos are decoded where `reconstruct` did it.
+fn open_clip(folder: &Path, sequence: &Sequence, elsewhere: Option<&Path>) -> Result<OpenedClip, CliError> {
     let held_out = sequence.views.iter().filter(|view| view.split == Split::Test);
     let frames = (sequence.frames.first(), sequence.frames.last());
     let options = ClipOptions {
@@ -86,15 +94,16 @@ fn open_clip(sequence: &Sequence, elsewhere: Option<&Path>) -> Result<Clip, CliE
         ..ClipOptions::default()
     };
     let path = elsewhere.unwrap_or(&sequence.clip.path);
-    let clip = Clip::open(path, &options)
+    let decoded = folder.join(STATE_FOLDER).join("decoded");
+    let opened = scratch::open(path, &options, Some(&decoded))
         .map_err(|error| CliError::BadInput(format!("{error}; --clip says where the clip is now")))?;
-    let digest = clip.digest().map_err(|error| CliError::BadInput(error.to_string()))?;
+    let digest = opened.clip.digest().map_err(|error| CliError::BadInput(error.to_string()))?;
     if digest != sequence.clip.digest {
         let why =
             format!("it is not the clip of this result (digest {digest}, not {})", sequence.clip.digest);
         return Err(CliError::bad_input(path.display(), format!("{why}; --clip says where that one is now")));
     }
-    Ok(clip)
+    Ok(opened)
 }
 
 fn measure(
@@ -153,5 +162,5 @@ fn print_table(measured: &[Measured]) {
         ]);
     }
     table::align(&mut table);
-    println!("{table}");
+    stdout::line(&table);
 }

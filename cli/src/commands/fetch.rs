@@ -9,7 +9,7 @@ use std::{
 use clap::Args;
 use trackersplat_proto::v1::{FetchChunk, FetchRequest};
 
-use crate::{args::CoordinatorArgs, client, error::CliError};
+use crate::{args::CoordinatorArgs, client, error::CliError, stdout};
 
 /// Arguments of `fetch`.
 #[derive(Args, Debug)]
@@ -37,7 +37,7 @@ pub(super) async fn run(args: FetchArgs) -> Result<(), CliError> {
         download.take(chunk)?;
     }
     let files = download.finish()?;
-    println!("{} files in {}", files, args.out.display());
+    stdout::line(format_args!("{} files in {}", files, args.out.display()));
     Ok(())
 }
 

@@ -6,7 +6,7 @@ use clap::Args;
 use splat::formats::ply::{self, Percentiles, PlySummary};
 
 use super::print_json;
-use crate::error::CliError;
+use crate::{error::CliError, stdout};
 
 /// Arguments of `inspect`.
 #[derive(Args, Debug)]
@@ -31,15 +31,17 @@ pub(super) fn run(args: InspectArgs) -> Result<(), CliError> {
 }
 
 fn print(summary: &PlySummary, bytes: usize) {
-    println!("Gaussians  {}", summary.count);
-    println!("SH degree  {}", summary.sh_degree);
-    println!("bytes      {bytes}");
+    stdout::line(format_args!("Gaussians  {}", summary.count));
+    stdout::line(format_args!("SH degree  {}", summary.sh_degree));
+    stdout::line(format_args!("bytes      {bytes}"));
     if let Some([low, high]) = summary.bounds {
-        println!("bounds     {low:?} to {high:?}");
+        stdout::line(format_args!("bounds     {low:?} to {high:?}"));
     }
     for (name, percentiles) in [("opacity", summary.opacity), ("scale", summary.scale)] {
         if let Some(Percentiles { min, p5, p50, p95, max }) = percentiles {
-            println!("{name:<10} min {min:.4}, 5 % {p5:.4}, median {p50:.4}, 95 % {p95:.4}, max {max:.4}");
+            stdout::line(format_args!(
+                "{name:<10} min {min:.4}, 5 % {p5:.4}, median {p50:.4}, 95 % {p95:.4}, max {max:.4}"
+            ));
         }
     }
 }

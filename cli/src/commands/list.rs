@@ -4,7 +4,7 @@ use clap::Args;
 use trackersplat_proto::v1::{JobSummary, ListRequest};
 
 use super::print_json;
-use crate::{args::CoordinatorArgs, client, error::CliError, outcome::job_state_label, table};
+use crate::{args::CoordinatorArgs, client, error::CliError, outcome::job_state_label, stdout, table};
 
 /// Arguments of `list`.
 #[derive(Args, Debug)]
@@ -35,7 +35,7 @@ pub(super) async fn run(args: ListArgs) -> Result<(), CliError> {
             job.clip.clone(),
         ]);
     }
-    println!("{table}");
+    stdout::line(&table);
     Ok(())
 }
 

@@ -19,6 +19,7 @@ use clap::{Parser, Subcommand};
 use crate::{
     error::{CliError, EXIT_CODES},
     logs::LogArgs,
+    stdout,
 };
 
 /// Moving 3D Gaussians from synchronized multi-view video.
@@ -104,7 +105,7 @@ fn wait(command: impl Future<Output = Result<(), CliError>>) -> Result<(), CliEr
 /// Prints a value for scripts.
 fn print_json(value: &impl serde::Serialize) -> Result<(), CliError> {
     let json = serde_json::to_string_pretty(value).map_err(|error| CliError::failed("JSON", error))?;
-    println!("{json}");
+    stdout::line(&json);
     Ok(())
 }
 

@@ -17,7 +17,7 @@ use crate::{
     interrupt,
     logs::LogArgs,
     outcome::{Outcome, job_state_label},
-    table,
+    stdout, table,
 };
 
 /// Arguments of `reconstruct`.
@@ -85,24 +85,24 @@ fn with_remedy(error: CliError, output: &Path) -> CliError {
 
 fn print_summary(outcome: &Outcome, output: &Path) {
     if !outcome.frames.is_empty() {
-        println!("{}", table::frames(outcome));
-        println!("PSNR and SSIM: mean over held-out views, before → after refinement\n");
+        stdout::line(table::frames(outcome));
+        stdout::line("PSNR and SSIM: mean over held-out views, before → after refinement\n");
     }
     if outcome.result().is_err() {
         return;
     }
     let at = |name: &str| output.join(name).display().to_string();
-    println!("frames         {}", at("frames"));
-    println!("description    {}", at("sequence.json"));
-    println!("metrics        {}", at("metrics.csv"));
+    stdout::line(format_args!("frames         {}", at("frames")));
+    stdout::line(format_args!("description    {}", at("sequence.json")));
+    stdout::line(format_args!("metrics        {}", at("metrics.csv")));
     if output.join(CONTACT_SHEET).exists() {
-        println!("contact sheet  {}", at(CONTACT_SHEET));
+        stdout::line(format_args!("contact sheet  {}", at(CONTACT_SHEET)));
     }
     let folder = output.display();
-    println!("\nnext:");
-    println!("  look at the contact sheet, or open the PLY files in a splat viewer such as SuperSplat");
-    println!("  trackersplat render {folder} --view NAME --frame 1 --out view.png");
-    println!("  trackersplat eval {folder}");
+    stdout::line("\nnext:");
+    stdout::line("  look at the contact sheet, or open the PLY files in a splat viewer such as SuperSplat");
+    stdout::line(format_args!("  trackersplat render {folder} --view NAME --frame 1 --out view.png"));
+    stdout::line(format_args!("  trackersplat eval {folder}"));
 }
 
 /// What `--json` prints.

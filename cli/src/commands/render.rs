@@ -7,7 +7,7 @@ use splat::{engine::Engine, raster::CpuEngine};
 use trackersplat_coordinator::assembly::sequence::Sequence;
 
 use super::eval::{read_frame, read_sequence};
-use crate::error::CliError;
+use crate::{error::CliError, stdout};
 
 /// Arguments of `render`.
 #[derive(Args, Debug)]
@@ -47,7 +47,7 @@ pub(super) fn run(args: RenderArgs) -> Result<(), CliError> {
     let image = rendering.map_err(|error| CliError::failed("rendering", error))?.image;
     std::fs::write(&args.out, image.encode_png())
         .map_err(|error| CliError::bad_input(args.out.display(), error))?;
-    println!("{}", args.out.display());
+    stdout::line(args.out.display());
     Ok(())
 }
 

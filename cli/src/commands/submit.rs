@@ -9,6 +9,7 @@ use crate::{
     args::{CoordinatorArgs, JobArgs},
     client,
     error::CliError,
+    stdout,
 };
 
 /// Arguments of `submit`.
@@ -36,6 +37,6 @@ pub(super) async fn run(args: SubmitArgs) -> Result<(), CliError> {
     if args.json {
         return print_json(&serde_json::json!({ "job_id": submitted.job_id, "resumed": submitted.resumed }));
     }
-    println!("{}", submitted.job_id);
+    stdout::line(submitted.job_id);
     Ok(())
 }

@@ -3,6 +3,7 @@
 use clap::Args;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{Failure, JobEvent, job_event::Event};
 
 use crate::{
@@ -14,7 +15,7 @@ use crate::{
     interrupt,
     logs::LogArgs,
     outcome::{Outcome, frame_state_label, job_state_label},
-    table,
+    stdout, table,
 };
 
 /// Arguments of `watch`.
@@ -38,28 +39,40 @@ pub(crate) struct WatchArgs {
 pub(super) async fn run(args: WatchArgs, logs: &LogArgs) -> Result<(), CliError> {
     let address = &args.coordinator.coordinator;
     let mut client = client::connect(address).await?;
-    let mut display: Box<dyn Display> =
-        if args.json { Box::new(JsonLines) } else { display::choose(logs, address) };
     let interrupted = interrupt::token()?;
+    let unread = interrupted.child_token();
+    let mut display: Box<dyn Display> = if args.json {
+        Box::new(JsonLines { unread: unread.clone() })
+    } else {
+        display::choose(logs, address)
+    };
     let (_, mut no_notes) = mpsc::unbounded_channel();
-    let followed =
-        follow(&mut client, &args.job, args.after, display.as_mut(), &mut no_notes, &interrupted).await;
+    let followed = follow(&mut client, &args.job, args.after, display.as_mut(), &mut no_notes, &unread).await;
     display.finish();
-    let Some(outcome) = followed? else {
+    let followed = followed?;
+    if unread.is_cancelled() && !interrupted.is_cancelled() {
+        return Ok(());
+    }
+    let Some(outcome) = followed else {
         return Err(CliError::Interrupted("interrupted; the job goes on, watch it again".to_owned()));
     };
     if !args.json && !outcome.frames.is_empty() {
-        println!("{}", table::frames(&outcome));
+        stdout::line(table::frames(&outcome));
     }
     outcome.result()
 }
 
 /// Every event as a line of JSON on standard output.
-struct JsonLines;
+struct JsonLines {
+    /// Cancelled when the reader has left: nothing more is wanted.
+    unread: CancellationToken,
+}
 
 impl Display for JsonLines {
     fn event(&mut self, event: &JobEvent, _outcome: &Outcome) {
-        println!("{}", to_json(event));
+        if !stdout::line(to_json(event)) {
+            self.unread.cancel();
+        }
     }
 
     fn no_worker(&mut self, _waiting_frames: u32) {}

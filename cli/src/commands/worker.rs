@@ -30,6 +30,10 @@ pub(crate) struct WorkerArgs {
     /// Seconds without a coordinator after which the worker gives up.
     #[arg(long, value_name = "SECONDS", default_value = "300", value_parser = seconds)]
     reconnect_for: Duration,
+
+    /// Never open the store's directory, even if it is there: all bulk goes through the coordinator.
+    #[arg(long)]
+    remote_blobs: bool,
 }
 
 pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
@@ -39,6 +43,7 @@ pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
         worker_id: args.id,
         state_dir: args.state_dir,
         reconnect_for: args.reconnect_for,
+        remote_blobs: args.remote_blobs,
     };
     match trackersplat_worker::run(options, Arc::new(CpuEngine), interrupt::token()?).await {
         Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
