@@ -12,10 +12,8 @@ use crate::{
     cameras::Camera,
     engine::{Engine, EngineError},
     gaussians::Gaussians,
+    raster::LOW_PASS,
 };
-
-/// Added to the projected covariance, px²: the rasterizer's low-pass filter.
-const LOW_PASS: f64 = 0.3;
 
 /// One view's fit of one Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,4 +1,4 @@
-//! Against the shared golden data and a clip with exact ground truth, where a checkout has them beside it.
+//! Against the golden data, and a clip with exact ground truth where a checkout has one beside it.
 
 use std::{
     fs::File,
@@ -36,7 +36,7 @@ fn triples(flat: &[f64]) -> Vec<[f32; 3]> {
 #[test]
 fn moments_and_affine_fits_follow_the_goldens() {
     for field in ["affine", "noisy", "bent"] {
-        let Some(path) = shared(&format!("goldens/motion_{field}.npz")) else { return };
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../tests/golden/motion_{field}.npz"));
         let get = |name: &str| array::<f64>(&path, name);
         let gaussians = Gaussians {
             means: triples(&get("in_mean")),
