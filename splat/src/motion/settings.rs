@@ -62,7 +62,7 @@ pub struct MotionSettings {
     /// Nearest neighbours per Gaussian; default 12, `draft` 8 (the paper's).
     pub neighbours: usize,
     /// Longest edge between neighbours, in medians of the distance to the farthest of the nearest neighbours;
-    /// default 4.
+    /// default 8.
     pub max_edge: f64,
     /// Expected departure of neighbours from moving as one rigid body, as a share of their distance; default
     /// 0.1.
@@ -70,11 +70,10 @@ pub struct MotionSettings {
     /// Colour difference between neighbours that halves their tie, as a distance in the sRGB cube; default
     /// 0.4, because texture differs within a body too.
     pub colour_scale: f64,
-    /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 30. Few wrong
-    /// seeds must not spread far.
+    /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 30: the
+    /// whole of a body, as what stays behind at its old place shows.
     pub max_hops: usize,
-    /// Agreeing neighbours that an unobserved Gaussian needs to follow them; default 1: beside a mover
-    /// whatever is left at its old place shows.
+    /// Agreeing neighbours that an unobserved Gaussian needs to follow them; default 1.
     pub min_support: usize,
     /// Rounds of robust reweighting of the neighbours' field; default 3, `draft` 2. Zero leaves the solved
     /// motions as they are.
