@@ -15,6 +15,8 @@ pub struct ServeOptions {
     pub heartbeat_interval: Duration,
     /// A lease without a heartbeat for this long expires; at least twice the heartbeat interval.
     pub lease_duration: Duration,
+    /// A lease whose stream broke waits this long for its worker to come back, at most `lease_duration`.
+    pub reconnect_grace: Duration,
     /// Failed attempts that a frame may have, at least 1.
     pub max_attempts: u32,
     /// Embedded mode: no other workers will ever join. They are dismissed when the last job has ended, and a frame
@@ -30,6 +32,7 @@ impl Default for ServeOptions {
             compute_threads: std::thread::available_parallelism().map_or(1, usize::from),
             heartbeat_interval: Duration::from_secs(1),
             lease_duration: Duration::from_secs(10),
+            reconnect_grace: Duration::from_secs(3),
             max_attempts: 3,
             dismiss_workers_when_idle: false,
         }

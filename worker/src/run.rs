@@ -206,6 +206,7 @@ impl Worker {
             device: format!("{} threads, {}", options.threads, std::env::consts::ARCH),
             threads: u32::try_from(options.threads).unwrap_or(u32::MAX),
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            held_lease_id: String::new(),
         };
         let runner = Arc::new(JobRunner {
             reconstruct,
@@ -228,16 +229,23 @@ impl Worker {
 
     async fn connect(&self) -> Result<Connection, WorkerError> {
         let patience = self.options.reconnect_for;
-        connection::connect(&self.channel, &self.register, patience, self.jitter_seed).await.map_err(
-            |error| match error {
+        let register = Register { held_lease_id: self.held_lease_id(), ..self.register.clone() };
+        connection::connect(&self.channel, &register, patience, self.jitter_seed).await.map_err(|error| {
+            match error {
                 ConnectionError::Refused(reason) => self.refused(reason),
                 ConnectionError::Lost(reason) => WorkerError::Unreachable {
                     coordinator: self.options.coordinator.clone(),
                     seconds: patience.as_secs(),
                     reason,
                 },
-            },
-        )
+            }
+        })
+    }
+
+    fn held_lease_id(&self) -> String {
+        let running = self.running.as_ref().map(|running| running.lease_id.clone());
+        let unacknowledged = || self.unacknowledged.as_ref().map(|report| report.lease_id.clone());
+        running.or_else(unacknowledged).unwrap_or_default()
     }
 
     fn refused(&self, reason: String) -> WorkerError {

@@ -158,6 +158,7 @@ async fn a_running_frame_goes_on_over_a_lost_stream_until_the_coordinator_decide
 
     let mut session = coordinator.welcome().await;
     assert_eq!(session.register.incarnation, incarnation, "the same process is the same incarnation");
+    assert_eq!(session.register.held_lease_id, "lease-1");
     let heartbeat = session
         .wait_for(|message| {
             if let worker_message::Message::Heartbeat(heartbeat) = message { Some(heartbeat) } else { None }
@@ -167,7 +168,7 @@ async fn a_running_frame_goes_on_over_a_lost_stream_until_the_coordinator_decide
     release.send(()).unwrap();
     let report = session.wait_for_report().await;
     assert_eq!(report.lease_id, "lease-1");
-    // As the real coordinator does: the lease was void since the stream broke.
+    // As a coordinator does that was restarted: it knows no lease of before.
     session.refuse(&report, "stale").await;
     session.wait_for_lease_request().await;
     dismiss(&session).await;

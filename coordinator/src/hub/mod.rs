@@ -107,8 +107,11 @@ impl Hub {
         engine: Arc<dyn Engine>,
         shutdown: CancellationToken,
     ) -> Self {
-        let policy =
-            QueuePolicy { max_attempts: options.max_attempts, lease_duration: options.lease_duration };
+        let policy = QueuePolicy {
+            max_attempts: options.max_attempts,
+            lease_duration: options.lease_duration,
+            reconnect_grace: options.reconnect_grace,
+        };
         let desk = Desk {
             queue: Queue::new(policy),
             sessions: BTreeMap::new(),

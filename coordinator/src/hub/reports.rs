@@ -44,10 +44,10 @@ impl Hub {
         let Report { lease_id, attempt, outcome } = report;
         let refusal = match outcome {
             Some(Outcome::Success(success)) => self.succeeded(session, &lease_id, attempt, success).await?,
-            Some(Outcome::Failure(reason)) => self.failed(session, &lease_id, attempt, reason).await?,
+            Some(Outcome::Failure(reason)) => self.gave_up(session, &lease_id, attempt, reason).await?,
             None => {
                 let reason = failure(FailureKind::Bug, "the worker's report has no outcome");
-                self.failed(session, &lease_id, attempt, reason).await?
+                self.gave_up(session, &lease_id, attempt, reason).await?
             }
         };
         let mut desk = self.desk.lock().await;
@@ -57,37 +57,48 @@ impl Hub {
         self.dispatch(&mut desk).await
     }
 
-    /// `None` if the failure counts, else why not.
-    async fn failed(
+    /// The worker reports a failure. `None` if it counts, else why not.
+    async fn gave_up(
         &self,
         session: SessionId,
         lease_id: &str,
         attempt: u32,
         reason: Failure,
     ) -> Result<Option<String>, StoreError> {
+        let held = self.desk.lock().await.queue.begin_report(session, lease_id, attempt).map(drop);
+        let refusal = match held {
+            Ok(()) => self.failed(lease_id, attempt, reason).await?,
+            Err(stale) => Some(stale.to_string()),
+        };
+        if let Some(stale) = &refusal {
+            tracing::warn!(lease_id, attempt, stale, "stale failure refused");
+        }
+        Ok(refusal)
+    }
+
+    /// A reported attempt has failed. `None`, or why the lease ended meanwhile.
+    async fn failed(
+        &self,
+        lease_id: &str,
+        attempt: u32,
+        reason: Failure,
+    ) -> Result<Option<String>, StoreError> {
         let mut desk = self.desk.lock().await;
-        match desk.queue.fail(session, lease_id, attempt, reason.kind()) {
-            Ok(failed) => {
-                self.record_failed(&mut desk, &failed, &reason).await?;
-                Ok(None)
-            }
-            Err(stale) => {
-                tracing::warn!(lease_id, attempt, %stale, "stale failure refused");
-                Ok(Some(stale.to_string()))
-            }
+        match desk.queue.fail(lease_id, attempt, reason.kind()) {
+            Ok(failed) => self.record_failed(&mut desk, &failed, &reason).await.map(|()| None),
+            Err(stale) => Ok(Some(stale.to_string())),
         }
     }
 
     /// A result does not count: the attempt has failed.
     async fn refused(
         &self,
-        session: SessionId,
         lease_id: &str,
         attempt: u32,
         reason: Failure,
     ) -> Result<Option<String>, StoreError> {
         let message = reason.message.clone();
-        let stale = self.failed(session, lease_id, attempt, reason).await?;
+        let stale = self.failed(lease_id, attempt, reason).await?;
         Ok(Some(stale.unwrap_or(message)))
     }
 
@@ -111,7 +122,7 @@ impl Hub {
         let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
         let Some((base, stop)) = run else {
             let reason = failure(FailureKind::Transient, "the job is not ready for results");
-            return self.refused(session, lease_id, attempt, reason).await;
+            return self.refused(lease_id, attempt, reason).await;
         };
         let delta = match self.verify(&lease, base, &success).await {
             Ok(delta) => delta,
@@ -122,7 +133,7 @@ impl Hub {
                 return Ok(Some(message));
             }
             Err(FrameError::Result(reason)) => {
-                return self.refused(session, lease_id, attempt, reason).await;
+                return self.refused(lease_id, attempt, reason).await;
             }
         };
         let stage_seconds: BTreeMap<String, f64> = success
@@ -132,7 +143,7 @@ impl Hub {
             .map(|stage| (stage.stage.clone(), stage.seconds))
             .collect();
         let mut desk = self.desk.lock().await;
-        let lease = match desk.queue.commit(session, lease_id, attempt) {
+        let lease = match desk.queue.commit(lease_id, attempt) {
             Ok(lease) => lease,
             Err(stale) => {
                 drop(desk);

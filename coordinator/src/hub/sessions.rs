@@ -6,14 +6,14 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use trackersplat_proto::v1::{
-    CancelLease, CoordinatorMessage, Heartbeat, Lease as LeaseMessage, Progress, Register,
+    CancelLease, CoordinatorMessage, FailureKind, Heartbeat, Lease as LeaseMessage, Progress, Register,
     coordinator_message::Message, job_event::Event,
 };
 
 use super::{Desk, Hub, Notice};
 use crate::{
     failure::failure,
-    queue::{FailedLease, Lease, SessionId, frame::FrameState},
+    queue::{Connected, FailedLease, Lease, SessionId, frame::FrameState},
     store::{AttemptOutcome, FrameEvent, StoreError},
 };
 
@@ -47,7 +47,7 @@ impl Desk {
 }
 
 impl Hub {
-    /// A worker's stream opens. Older streams of the same worker are closed, their leases lost.
+    /// A worker's stream opens. Older streams of the same worker are closed; a lease that it still holds goes on.
     pub(crate) async fn register(
         &self,
         worker: &Register,
@@ -60,36 +60,32 @@ impl Hub {
         let mut change = self.store.change().await?;
         change.worker_connected(worker).await?;
         change.commit().await?;
-        for older in desk.queue.connect(session, &worker.worker_id) {
-            self.lose(&mut desk, older, "the worker registered again").await?;
-        }
+        let Connected { replaced, lost } = desk.queue.connect(session, worker, Instant::now());
         let entry = Session { worker_id: worker.worker_id.clone(), outgoing, close: close.clone() };
         desk.sessions.insert(session, entry);
+        for older in replaced {
+            self.forget(&mut desk, older).await?;
+        }
+        for failed in lost {
+            let message = format!("worker {} came back without this frame", worker.worker_id);
+            self.record_failed(&mut desk, &failed, &failure(FailureKind::LostWorker, message)).await?;
+        }
         tracing::info!(worker_id = worker.worker_id, device = worker.device, "worker connected");
-        self.tell_workers(&mut desk);
+        self.dispatch(&mut desk).await?;
         Ok(Registered { session, close })
     }
 
-    /// A worker's stream is gone. At shutdown this is the coordinator's own doing: the lease is void after the restart
-    /// and does not count as failed.
+    /// A worker's stream is gone: its lease waits for it to come back. At shutdown this is the coordinator's own doing:
+    /// the lease is void after the restart and does not count as failed.
     pub(crate) async fn disconnected(&self, session: SessionId) -> Result<(), StoreError> {
         let mut desk = self.desk.lock().await;
         if self.shutdown.is_cancelled() || !desk.sessions.contains_key(&session) {
             return Ok(());
         }
-        self.lose(&mut desk, session, "the connection to the worker broke").await?;
+        desk.queue.disconnect(session, Instant::now());
+        let worker_id = self.forget(&mut desk, session).await?;
+        tracing::info!(worker_id, "the connection to the worker broke");
         self.dispatch(&mut desk).await
-    }
-
-    async fn lose(&self, desk: &mut Desk, session: SessionId, reason: &str) -> Result<(), StoreError> {
-        let worker_id = self.forget(desk, session).await?;
-        tracing::info!(worker_id, reason, "worker gone");
-        if let Some(failed) = desk.queue.disconnect(session) {
-            let message = format!("{reason} (worker {worker_id})");
-            let lost = failure(trackersplat_proto::v1::FailureKind::LostWorker, message);
-            self.record_failed(desk, &failed, &lost).await?;
-        }
-        Ok(())
     }
 
     /// A worker drains: its lease goes back without counting as failed.
@@ -159,9 +155,13 @@ impl Hub {
         let mut desk = self.desk.lock().await;
         for failed in desk.queue.expire(now) {
             let FailedLease { lease, .. } = &failed;
-            let silence = self.options.lease_duration;
-            let message = format!("no heartbeat of worker {} for {silence:?}", lease.worker_id);
-            let lost = failure(trackersplat_proto::v1::FailureKind::LostWorker, message);
+            let worker = &lease.worker_id;
+            let message = if desk.sessions.contains_key(&lease.session) {
+                format!("no heartbeat of worker {worker} for {:?}", self.options.lease_duration)
+            } else {
+                format!("the connection to worker {worker} broke, and it did not come back")
+            };
+            let lost = failure(FailureKind::LostWorker, message);
             let reason = "the lease has expired".to_owned();
             desk.send(
                 lease.session,

@@ -15,7 +15,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use trackersplat_proto::{failure::RetryPolicy, v1::FailureKind};
+use trackersplat_proto::{
+    failure::RetryPolicy,
+    v1::{FailureKind, Register},
+};
 
 use self::retry::{Decision, decide};
 
@@ -46,7 +49,9 @@ pub struct Lease {
     pub key: FrameKey,
     /// Who holds it.
     pub worker_id: String,
-    /// Over which stream it was given.
+    /// The process that holds it: a worker that was started again does not.
+    incarnation: String,
+    /// The stream over which it is held.
     pub session: SessionId,
     /// When it was given.
     pub since: Instant,
@@ -63,6 +68,15 @@ pub struct FailedLease {
     pub lease: Lease,
     /// Whether the frame is ready again; else it has failed.
     pub retried: bool,
+}
+
+/// What a new stream of a worker ends.
+#[derive(Debug, Default, PartialEq)]
+pub struct Connected {
+    /// Older streams of the same worker, which the caller must close.
+    pub replaced: Vec<SessionId>,
+    /// Leases of the worker that it does not hold any more.
+    pub lost: Vec<FailedLease>,
 }
 
 /// Why a heartbeat or report has no effect.
@@ -93,6 +107,8 @@ pub struct QueuePolicy {
     pub max_attempts: u32,
     /// A lease without a heartbeat for this long expires.
     pub lease_duration: Duration,
+    /// A lease whose stream broke expires after this long, unless its holder comes back.
+    pub reconnect_grace: Duration,
 }
 
 /// What the queue must know of a frame that becomes open.
@@ -117,6 +133,7 @@ struct OpenFrame {
 #[derive(Debug)]
 struct Session {
     worker_id: String,
+    incarnation: String,
     /// Place in the line of workers that ask for a frame.
     ticket: Option<u64>,
     lease: Option<String>,
@@ -149,19 +166,40 @@ impl Queue {
         self.frames.entry(key).or_insert_with(|| OpenFrame { history, ..OpenFrame::default() });
     }
 
-    /// A worker's stream opens. Returns older streams of the same worker, which the caller must close.
-    pub fn connect(&mut self, session: SessionId, worker_id: &str) -> Vec<SessionId> {
-        let older = self.sessions.iter().filter(|(_, other)| other.worker_id == worker_id);
-        let older = older.map(|(&id, _)| id).collect();
-        let entry = Session { worker_id: worker_id.to_owned(), ticket: None, lease: None };
+    /// A worker's stream opens, in place of older ones of the same worker. A lease that this very process still holds
+    /// goes on over the new stream; others of this worker have failed as lost.
+    pub fn connect(&mut self, session: SessionId, worker: &Register, now: Instant) -> Connected {
+        let of_worker = |other: &Session| other.worker_id == worker.worker_id;
+        let replaced =
+            self.sessions.iter().filter(|(_, other)| of_worker(other)).map(|(&id, _)| id).collect();
+        self.sessions.retain(|_, other| !of_worker(other));
+        let mut entry = Session {
+            worker_id: worker.worker_id.clone(),
+            incarnation: worker.incarnation.clone(),
+            ticket: None,
+            lease: None,
+        };
+        let mut lost = Vec::new();
+        for lease in self.leases.values_mut().filter(|lease| lease.worker_id == worker.worker_id) {
+            if lease.incarnation == worker.incarnation && lease.id == worker.held_lease_id {
+                lease.session = session;
+                lease.deadline = now + self.policy.lease_duration;
+                entry.lease = Some(lease.id.clone());
+            } else if !lease.reporting {
+                lost.push(lease.id.clone());
+            }
+        }
         self.sessions.insert(session, entry);
-        older
+        let lost = lost.iter().filter_map(|id| self.end_failed(id, FailureKind::LostWorker)).collect();
+        Connected { replaced, lost }
     }
 
-    /// A worker's stream is gone: its lease has failed as lost.
-    pub fn disconnect(&mut self, session: SessionId) -> Option<FailedLease> {
-        let lease_id = self.sessions.remove(&session)?.lease?;
-        self.end_failed(&lease_id, FailureKind::LostWorker)
+    /// A worker's stream is gone: the lease waits a little for its holder to come back.
+    pub fn disconnect(&mut self, session: SessionId, now: Instant) {
+        let Some(lease_id) = self.sessions.remove(&session).and_then(|session| session.lease) else { return };
+        if let Some(lease) = self.leases.get_mut(&lease_id) {
+            lease.deadline = lease.deadline.min(now + self.policy.reconnect_grace);
+        }
     }
 
     /// A worker drains: it gets nothing more, and its lease is void without counting as a failed attempt.
@@ -204,7 +242,8 @@ impl Queue {
         now: Instant,
         new_lease_id: &mut impl FnMut() -> String,
     ) -> Option<Lease> {
-        let worker_id = self.sessions.get(&session_id)?.worker_id.clone();
+        let Session { worker_id, incarnation, .. } = self.sessions.get(&session_id)?;
+        let (worker_id, incarnation) = (worker_id.clone(), incarnation.clone());
         let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());
         let key = ready.into_iter().find(|(_, frame)| self.may_take(frame, &worker_id))?.0.clone();
         let frame = self.frames.get_mut(&key)?;
@@ -216,6 +255,7 @@ impl Queue {
             attempt: frame.history.attempts,
             key,
             worker_id,
+            incarnation,
             session: session_id,
             since: now,
             deadline: now + self.policy.lease_duration,
@@ -252,7 +292,7 @@ impl Queue {
         Ok(lease)
     }
 
-    /// A result has arrived: the lease does not expire while it is verified.
+    /// A report has arrived: the lease does not expire while it is verified, whatever becomes of the stream.
     pub fn begin_report(
         &mut self,
         session: SessionId,
@@ -265,22 +305,16 @@ impl Queue {
     }
 
     /// The verified result counts: the frame is closed.
-    pub fn commit(&mut self, session: SessionId, lease_id: &str, attempt: u32) -> Result<Lease, Stale> {
-        self.held(session, lease_id, attempt)?;
+    pub fn commit(&mut self, lease_id: &str, attempt: u32) -> Result<Lease, Stale> {
+        self.in_force(lease_id, attempt)?;
         let lease = self.end(lease_id).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))?;
         self.frames.remove(&lease.key);
         Ok(lease)
     }
 
     /// The attempt failed.
-    pub fn fail(
-        &mut self,
-        session: SessionId,
-        lease_id: &str,
-        attempt: u32,
-        kind: FailureKind,
-    ) -> Result<FailedLease, Stale> {
-        self.held(session, lease_id, attempt)?;
+    pub fn fail(&mut self, lease_id: &str, attempt: u32, kind: FailureKind) -> Result<FailedLease, Stale> {
+        self.in_force(lease_id, attempt)?;
         self.end_failed(lease_id, kind).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))
     }
 
@@ -336,10 +370,15 @@ impl Queue {
     }
 
     fn held(&mut self, session: SessionId, lease_id: &str, attempt: u32) -> Result<&mut Lease, Stale> {
-        let lease = self.leases.get_mut(lease_id).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))?;
+        let lease = self.in_force(lease_id, attempt)?;
         if lease.session != session {
             return Err(Stale::OtherWorker(lease_id.to_owned()));
         }
+        Ok(lease)
+    }
+
+    fn in_force(&mut self, lease_id: &str, attempt: u32) -> Result<&mut Lease, Stale> {
+        let lease = self.leases.get_mut(lease_id).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))?;
         if lease.attempt != attempt {
             let lease_id = lease_id.to_owned();
             return Err(Stale::OtherAttempt { lease_id, held: lease.attempt, given: attempt });
@@ -351,7 +390,7 @@ impl Queue {
     fn end(&mut self, lease_id: &str) -> Option<Lease> {
         let lease = self.leases.remove(lease_id)?;
         if let Some(session) = self.sessions.get_mut(&lease.session) {
-            session.lease = None;
+            session.lease.take_if(|held| held == lease_id);
         }
         Some(lease)
     }

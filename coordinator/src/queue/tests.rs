@@ -1,6 +1,7 @@
 use super::*;
 
 const LEASE: Duration = Duration::from_secs(10);
+const GRACE: Duration = Duration::from_secs(3);
 
 /// A queue with its own clock and lease names, so that no test sleeps.
 struct Bench {
@@ -11,7 +12,8 @@ struct Bench {
 
 impl Bench {
     fn new(frames: impl IntoIterator<Item = u32>) -> Self {
-        let mut queue = Queue::new(QueuePolicy { max_attempts: 3, lease_duration: LEASE });
+        let policy = QueuePolicy { max_attempts: 3, lease_duration: LEASE, reconnect_grace: GRACE };
+        let mut queue = Queue::new(policy);
         for frame in frames {
             queue.add(key(frame), FrameHistory::default());
         }
@@ -20,9 +22,15 @@ impl Bench {
 
     fn connect(&mut self, session: u64, worker: &str) -> SessionId {
         let session = SessionId(session);
-        self.queue.connect(session, worker);
+        self.queue.connect(session, &register(worker, "", ""), self.now);
         self.queue.park(session);
         session
+    }
+
+    /// The worker's stream breaks, and it does not come back.
+    fn lose(&mut self, session: SessionId) -> Vec<FailedLease> {
+        self.queue.disconnect(session, self.now);
+        self.queue.expire(self.now + GRACE)
     }
 
     fn assign(&mut self) -> Vec<Lease> {
@@ -40,10 +48,18 @@ impl Bench {
     }
 
     fn fail(&mut self, lease: &Lease, kind: FailureKind) -> FailedLease {
-        let failed =
-            self.queue.fail(lease.session, &lease.id, lease.attempt, kind).expect("the lease is held");
+        let failed = self.queue.fail(&lease.id, lease.attempt, kind).expect("the lease is held");
         self.queue.park(lease.session);
         failed
+    }
+}
+
+fn register(worker: &str, incarnation: &str, held_lease_id: &str) -> Register {
+    Register {
+        worker_id: worker.into(),
+        incarnation: incarnation.into(),
+        held_lease_id: held_lease_id.into(),
+        ..Register::default()
     }
 }
 
@@ -55,7 +71,7 @@ fn key(frame: u32) -> FrameKey {
 fn frames_go_out_in_order_to_the_worker_that_asked_first() {
     let mut bench = Bench::new([3, 1, 2]);
     let late = SessionId(1);
-    bench.queue.connect(late, "late");
+    bench.queue.connect(late, &register("late", "", ""), bench.now);
     bench.connect(2, "early");
     bench.queue.park(late);
     let leases = bench.assign();
@@ -85,11 +101,11 @@ fn a_worker_holds_one_lease_however_often_it_asks() {
 #[test]
 fn a_committed_frame_is_closed_and_its_lease_dead() {
     let mut bench = Bench::new([1]);
-    let session = bench.connect(1, "w");
+    bench.connect(1, "w");
     let lease = bench.assign_one();
-    assert_eq!(bench.queue.commit(session, &lease.id, 1).expect("held").key, key(1));
+    assert_eq!(bench.queue.commit(&lease.id, 1).expect("held").key, key(1));
     assert_eq!(bench.queue.open_frames("job"), 0);
-    assert_eq!(bench.queue.commit(session, &lease.id, 1), Err(Stale::NotHeld(lease.id)));
+    assert_eq!(bench.queue.commit(&lease.id, 1), Err(Stale::NotHeld(lease.id)));
 }
 
 #[test]
@@ -101,12 +117,13 @@ fn stale_messages_are_told_apart() {
     let wrong_attempt = Stale::OtherAttempt { lease_id: lease.id.clone(), held: 1, given: 2 };
     assert_eq!(bench.queue.heartbeat(session, &lease.id, 2, bench.now), Err(wrong_attempt.clone()));
     assert_eq!(bench.queue.begin_report(session, &lease.id, 2), Err(wrong_attempt.clone()));
-    assert_eq!(bench.queue.commit(session, &lease.id, 2), Err(wrong_attempt.clone()));
-    assert_eq!(bench.queue.fail(session, &lease.id, 2, FailureKind::Bug), Err(wrong_attempt));
+    assert_eq!(bench.queue.commit(&lease.id, 2), Err(wrong_attempt.clone()));
+    assert_eq!(bench.queue.fail(&lease.id, 2, FailureKind::Bug), Err(wrong_attempt));
     let stolen = Stale::OtherWorker(lease.id.clone());
-    assert_eq!(bench.queue.commit(other, &lease.id, 1), Err(stolen));
-    assert_eq!(bench.queue.commit(session, "lease-9", 1), Err(Stale::NotHeld("lease-9".into())));
-    assert!(bench.queue.commit(session, &lease.id, 1).is_ok(), "none of them harmed the lease");
+    assert_eq!(bench.queue.heartbeat(other, &lease.id, 1, bench.now), Err(stolen.clone()));
+    assert_eq!(bench.queue.begin_report(other, &lease.id, 1), Err(stolen));
+    assert_eq!(bench.queue.commit("lease-9", 1), Err(Stale::NotHeld("lease-9".into())));
+    assert!(bench.queue.commit(&lease.id, 1).is_ok(), "none of them harmed the lease");
 }
 
 #[test]
@@ -121,7 +138,7 @@ fn a_silent_lease_expires_at_its_deadline_and_a_heartbeat_moves_it() {
     assert_eq!(bench.queue.expire(start + LEASE), []);
     let expired = bench.queue.expire(start + almost + LEASE);
     assert!(expired.len() == 1 && expired[0].retried && expired[0].lease.id == lease.id);
-    let late = bench.queue.commit(session, &lease.id, 1);
+    let late = bench.queue.commit(&lease.id, 1);
     assert_eq!(late, Err(Stale::NotHeld(lease.id)), "its report is refused");
 }
 
@@ -132,7 +149,7 @@ fn a_lease_does_not_expire_while_its_result_is_verified() {
     let lease = bench.assign_one();
     bench.queue.begin_report(session, &lease.id, 1).expect("held");
     assert_eq!(bench.queue.expire(bench.now + 10 * LEASE), []);
-    assert!(bench.queue.commit(session, &lease.id, 1).is_ok());
+    assert!(bench.queue.commit(&lease.id, 1).is_ok());
 }
 
 #[test]
@@ -176,11 +193,11 @@ fn a_lost_frame_prefers_another_worker_and_takes_the_same_if_it_is_alone() {
     let mut bench = Bench::new([1]);
     let lost = bench.connect(1, "a");
     bench.assign_one();
-    assert!(bench.queue.disconnect(lost).expect("a lease").retried);
+    assert!(bench.lose(lost)[0].retried);
     bench.connect(2, "a");
-    bench.queue.connect(SessionId(3), "b");
+    bench.queue.connect(SessionId(3), &register("b", "", ""), bench.now);
     assert_eq!(bench.assign(), [], "b is connected and will ask");
-    assert_eq!(bench.queue.disconnect(SessionId(3)), None);
+    assert_eq!(bench.lose(SessionId(3)), []);
     let lease = bench.assign_one();
     assert_eq!((lease.worker_id.as_str(), lease.attempt), ("a", 2));
 }
@@ -207,19 +224,61 @@ fn a_cancelled_job_loses_its_leases_and_frames_and_no_other() {
     assert_eq!(cancelled.as_slice(), std::slice::from_ref(&lease));
     assert_eq!(bench.queue.cancel_job("job"), []);
     assert_eq!((bench.queue.open_frames("job"), bench.queue.open_frames("other")), (0, 1));
-    assert!(bench.queue.commit(session, &lease.id, 1).is_err());
+    assert!(bench.queue.commit(&lease.id, 1).is_err());
     bench.queue.park(session);
     assert_eq!(&*bench.assign_one().key.job, "other");
 }
 
 #[test]
-fn a_worker_that_registers_again_replaces_its_older_stream() {
+fn a_lease_goes_on_when_its_holder_comes_back_in_time() {
     let mut bench = Bench::new([1]);
-    let old = bench.connect(1, "w");
-    bench.assign_one();
-    assert_eq!(bench.queue.connect(SessionId(2), "w"), [old]);
-    assert!(bench.queue.disconnect(old).expect("its lease").retried);
-    assert_eq!(bench.queue.connected(), 1);
+    let broken = SessionId(1);
+    bench.queue.connect(broken, &register("w", "process", ""), bench.now);
+    bench.queue.park(broken);
+    let lease = bench.assign_one();
+    bench.queue.disconnect(broken, bench.now);
+    let back = SessionId(2);
+    let soon = bench.now + GRACE - Duration::from_millis(1);
+    assert_eq!(bench.queue.expire(soon), []);
+    let again = register("w", "process", &lease.id);
+    assert_eq!(bench.queue.connect(back, &again, soon), Connected::default());
+    assert_eq!(bench.queue.expire(soon + LEASE - Duration::from_millis(1)), [], "a full lease again");
+    bench.queue.park(back);
+    assert_eq!(bench.assign(), [], "it is busy");
+    assert!(bench.queue.heartbeat(broken, &lease.id, 1, soon).is_err(), "the old stream is dead");
+    assert!(bench.queue.begin_report(back, &lease.id, 1).is_ok());
+    assert!(bench.queue.commit(&lease.id, 1).is_ok());
+}
+
+#[test]
+fn a_lease_is_lost_when_its_holder_does_not_come_back_or_forgot_it() {
+    let returns = [register("w", "process", ""), register("w", "another process", "lease-1")];
+    for again in returns {
+        let mut bench = Bench::new([1]);
+        bench.queue.connect(SessionId(1), &register("w", "process", ""), bench.now);
+        bench.queue.park(SessionId(1));
+        bench.assign_one();
+        let Connected { replaced, lost } = bench.queue.connect(SessionId(2), &again, bench.now);
+        assert_eq!(replaced, [SessionId(1)], "its older stream had not been noticed to be broken");
+        assert!(lost.len() == 1 && lost[0].retried, "{again:?}");
+        assert_eq!(bench.queue.connected(), 1);
+    }
+    let mut bench = Bench::new([1]);
+    let broken = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    let lost = bench.lose(broken);
+    assert!(lost.len() == 1 && lost[0].retried && lost[0].lease.id == lease.id);
+}
+
+#[test]
+fn a_result_that_is_verified_counts_though_its_stream_broke() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    bench.queue.begin_report(session, &lease.id, 1).expect("held");
+    assert_eq!(bench.lose(session), []);
+    assert_eq!(bench.queue.connect(SessionId(2), &register("w", "new", ""), bench.now).lost, []);
+    assert!(bench.queue.commit(&lease.id, 1).is_ok());
 }
 
 #[test]

@@ -30,10 +30,13 @@ fn new_job(id: &str) -> NewJob {
 
 /// Leases as the queue makes them.
 fn lease(job: &str, frame: u32, attempts: u32) -> Lease {
-    let mut queue = Queue::new(QueuePolicy { max_attempts: 3, lease_duration: Duration::from_secs(1) });
+    let lease_duration = Duration::from_secs(1);
+    let policy = QueuePolicy { max_attempts: 3, lease_duration, reconnect_grace: Duration::ZERO };
+    let mut queue = Queue::new(policy);
     let history = crate::queue::FrameHistory { attempts, ..Default::default() };
     queue.add(FrameKey { job: job.into(), frame }, history);
-    queue.connect(SessionId(1), "w");
+    let worker = Register { worker_id: "w".into(), ..Register::default() };
+    queue.connect(SessionId(1), &worker, Instant::now());
     queue.park(SessionId(1));
     queue.assign(Instant::now(), || format!("lease-{job}-{frame}-{attempts}")).remove(0)
 }

@@ -88,6 +88,7 @@ impl Bench {
             // Long enough that no lease expires unless a test wants it to.
             heartbeat_interval: Duration::from_millis(20),
             lease_duration: Duration::from_secs(60),
+            reconnect_grace: Duration::from_millis(100),
             ..ServeOptions::default()
         };
         adjust(&mut options);
@@ -262,6 +263,7 @@ pub(super) fn register(id: &str) -> Register {
         device: "test".into(),
         threads: 1,
         version: env!("CARGO_PKG_VERSION").into(),
+        held_lease_id: String::new(),
     }
 }
 

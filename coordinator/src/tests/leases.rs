@@ -126,7 +126,7 @@ async fn heartbeats_are_progress_and_a_stale_one_is_answered_with_cancel() {
 }
 
 #[tokio::test]
-async fn a_broken_stream_gives_the_frame_to_another_worker_at_once() {
+async fn a_broken_stream_gives_the_frame_to_another_worker_after_the_grace() {
     let bench = Bench::start().await;
     let job = bench.submitted().await;
     let mut lost = bench.worker("lost").await;
@@ -134,9 +134,29 @@ async fn a_broken_stream_gives_the_frame_to_another_worker_at_once() {
     let mut other = bench.worker("other").await;
     drop(lost);
     let mut watch = bench.watch(&job, 0).await;
-    assert_eq!(watch.frame(1, FrameState::Ready).await.unwrap().kind(), FailureKind::LostWorker);
+    let failure = watch.frame(1, FrameState::Ready).await.unwrap();
+    assert_eq!(failure.kind(), FailureKind::LostWorker);
+    assert!(failure.message.contains("lost broke"), "{}", failure.message);
     let lease = other.lease().await;
     assert_eq!((lease.job.unwrap().frame, lease.attempt), (1, 2));
+}
+
+#[tokio::test]
+async fn a_worker_that_comes_back_keeps_its_lease_and_its_result_counts() {
+    let bench = Bench::start_with(|options| options.reconnect_grace = Duration::from_secs(60)).await;
+    let job = bench.submitted().await;
+    let mut worker = bench.worker("w").await;
+    let lease = worker.lease().await;
+    let success = bench.result(&lease).await;
+    drop(worker);
+    let held = Register { held_lease_id: lease.lease_id.clone(), ..register("w") };
+    let again = worker_message::Message::Register(held);
+    let mut worker = Worker::say(bench.channel.clone().unwrap(), again).await.unwrap();
+    assert!(worker.report(&lease, Outcome::Success(success)).await.accepted);
+    let mut watch = bench.watch(&job, 0).await;
+    let done = |event: &Event| matches!(event, Event::FrameState(f) if f.state() == FrameState::Done);
+    let Some(Event::FrameState(done)) = watch.until(done).await.event else { panic!("not a frame") };
+    assert_eq!((done.frame, done.attempt), (1, 1));
 }
 
 #[tokio::test]
