@@ -32,6 +32,10 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds, help_heading = "Leases")]
     lease_duration: Duration,
 
+    /// Seconds that a lease waits for its worker to come back after the connection broke.
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds, help_heading = "Leases")]
+    reconnect_grace: Duration,
+
     /// Failed attempts that a frame may have.
     #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Leases")]
     max_attempts: u32,
@@ -45,6 +49,7 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
         compute_threads: args.compute_threads.unwrap_or_else(cores),
         heartbeat_interval: args.heartbeat_interval,
         lease_duration: args.lease_duration,
+        reconnect_grace: args.reconnect_grace,
         max_attempts: args.max_attempts,
         dismiss_workers_when_idle: false,
     };
