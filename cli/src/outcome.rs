@@ -100,20 +100,6 @@ impl Outcome {
     }
 }
 
-/// Mean over frames or views; the moving region's over those that have one. `None` of none.
-pub(crate) fn average<'a>(metrics: impl Iterator<Item = &'a ViewMetrics>) -> Option<ViewMetrics> {
-    let metrics: Vec<_> = metrics.collect();
-    let moving: Vec<f64> = metrics.iter().filter_map(|m| m.moving_psnr).collect();
-    let mean =
-        |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
-    Some(ViewMetrics {
-        view: "mean".into(),
-        psnr: mean(&metrics.iter().map(|m| m.psnr).collect::<Vec<_>>())?,
-        ssim: mean(&metrics.iter().map(|m| m.ssim).collect::<Vec<_>>())?,
-        moving_psnr: mean(&moving),
-    })
-}
-
 /// A job's state for people and scripts.
 pub(crate) fn job_state_label(state: JobState) -> &'static str {
     match state {

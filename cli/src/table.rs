@@ -1,9 +1,9 @@
 //! The table at the end: a row per frame.
 
 use comfy_table::{Cell, CellAlignment, Table, presets};
-use splat::frame::ViewMetrics;
+use splat::frame::{ViewMetrics, mean};
 
-use crate::outcome::{Outcome, average};
+use crate::outcome::Outcome;
 
 const HEADER: [&str; 6] = ["frame", "state", "PSNR dB", "SSIM", "moving PSNR dB", "seconds"];
 
@@ -17,8 +17,8 @@ pub(crate) fn frames(outcome: &Outcome) -> String {
         table.add_row([number.to_string(), frame.state.to_owned(), psnr, ssim, moving, seconds]);
     }
     let all: Vec<_> = outcome.frames.values().map(|frame| frame.means()).collect();
-    let before = average(all.iter().filter_map(|(before, _)| *before));
-    let after = average(all.iter().filter_map(|(_, after)| *after));
+    let before = mean(all.iter().filter_map(|(before, _)| *before));
+    let after = mean(all.iter().filter_map(|(_, after)| *after));
     if outcome.frames.len() > 1 && after.is_some() {
         let [psnr, ssim, moving] = columns(before.as_ref(), after.as_ref());
         table.add_row(["mean".to_owned(), String::new(), psnr, ssim, moving, String::new()]);

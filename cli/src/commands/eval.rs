@@ -8,8 +8,7 @@ use splat::{
     clip::{Clip, ClipOptions, Split},
     engine::Engine,
     formats::ply,
-    frame::ViewMetrics,
-    metrics,
+    frame::{self, ViewMetrics},
     raster::CpuEngine,
 };
 use trackersplat_coordinator::assembly::sequence::{Sequence, SequenceFrame};
@@ -18,7 +17,6 @@ use super::print_json;
 use crate::{
     embedded::STATE_FOLDER,
     error::CliError,
-    outcome,
     scratch::{self, OpenedClip},
     stdout, table,
 };
@@ -124,12 +122,7 @@ fn measure(
         let mut image = rendering.map_err(|error| CliError::failed(&view.name, error))?.image;
         // What a viewer shows.
         image.pixels.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));
-        views.push(ViewMetrics {
-            view: view.name.clone(),
-            psnr: metrics::psnr(&image, &truth),
-            ssim: metrics::ssim(&image, &truth),
-            moving_psnr: mask.and_then(|mask| metrics::masked_psnr(&image, &truth, &mask)),
-        });
+        views.push(frame::view_metrics(&view.name, &image, &truth, mask.as_deref()));
     }
     let recorded = frame.report.as_ref().map(|report| report.after.clone()).unwrap_or_default();
     Ok(Measured { frame: frame.number, views, recorded })
@@ -150,8 +143,8 @@ fn print_table(measured: &[Measured]) {
             ]);
         }
     }
-    let means: Vec<ViewMetrics> = measured.iter().flat_map(|frame| frame.views.iter().cloned()).collect();
-    if let Some(mean) = outcome::average(means.iter()) {
+    let views = measured.iter().flat_map(|frame| &frame.views);
+    if let Some(mean) = frame::mean(views) {
         table.add_row([
             "mean".to_owned(),
             String::new(),

@@ -17,35 +17,42 @@ pub(super) struct Bars {
     stage: ProgressBar,
     frames: ProgressBar,
     running: BTreeMap<u32, ProgressBar>,
+    are_frames_running: bool,
 }
 
 impl Bars {
     pub(super) fn new(coordinator: &str) -> Self {
         let all = MultiProgress::new();
         let stage = all.add(ProgressBar::new(0));
-        stage.set_style(style("{spinner} {prefix:<14} {bar:30} {pos}/{len} {elapsed} {msg}"));
         stage.enable_steady_tick(REDRAW);
+        advance(&stage, "{spinner}", 0, 0);
         let frames = all.add(ProgressBar::new(0));
-        frames.set_style(style("  {prefix:<14} {bar:30} {pos}/{len} {msg}"));
-        frames.set_prefix("frames");
-        Self { coordinator: coordinator.to_owned(), all, stage, frames, running: BTreeMap::new() }
+        advance(&frames, " ", 0, 0);
+        Self {
+            coordinator: coordinator.to_owned(),
+            all,
+            stage,
+            frames,
+            running: BTreeMap::new(),
+            are_frames_running: false,
+        }
     }
 
     fn progress(&mut self, progress: &Progress) {
         if progress.frame == 0 {
-            self.stage.set_prefix(progress.stage.clone());
-            self.stage.set_length(progress.total);
-            self.stage.set_position(progress.done);
+            // Handing frames out is over before anybody could read it.
+            if self.are_frames_running {
+                return;
+            }
+            advance(&self.stage, "{spinner}", progress.done, progress.total);
             return;
         }
         let bar = self.running.entry(progress.frame).or_insert_with(|| {
             let bar = self.all.add(ProgressBar::new(0));
-            bar.set_style(style("  {prefix:<14} {bar:30} {pos}/{len} {msg}"));
             bar.set_prefix(format!("frame {}", progress.frame));
             bar
         });
-        bar.set_length(progress.total);
-        bar.set_position(progress.done);
+        advance(bar, " ", progress.done, progress.total);
         bar.set_message(format!("{} on {}", progress.stage, progress.worker_id));
     }
 }
@@ -55,10 +62,12 @@ impl Display for Bars {
         match &event.event {
             Some(Event::JobState(change)) => {
                 self.stage.set_prefix(job_state_label(change.state()));
-                self.stage.set_length(0);
-                self.stage.set_position(0);
-                let is_on_workers = change.state() == JobState::Frames;
-                self.stage.set_message(if is_on_workers { "on the workers" } else { "" });
+                self.stage.reset_eta();
+                advance(&self.stage, "{spinner}", 0, 0);
+                self.are_frames_running = change.state() == JobState::Frames;
+                if self.are_frames_running {
+                    self.frames.set_prefix("done");
+                }
             }
             Some(Event::FrameState(change)) => {
                 if change.state() != FrameState::Leased
@@ -73,12 +82,15 @@ impl Display for Bars {
                         change.frame, change.attempt, change.worker_id, failure.message
                     ));
                 }
+                let done = outcome.frames_in(FrameState::Done).len();
+                self.frames.set_style(style("  {prefix:<14} {bar:30} {pos}/{len}"));
                 self.frames.set_length(outcome.frames.len() as u64);
-                self.frames.set_position(outcome.frames_in(FrameState::Done).len() as u64);
+                self.frames.set_position(done as u64);
             }
             Some(Event::Progress(progress)) => self.progress(progress),
             Some(Event::Workers(workers)) => {
-                self.frames.set_message(format!("{} workers", workers.connected));
+                let plural = if workers.connected == 1 { "" } else { "s" };
+                self.stage.set_message(format!("{} worker{plural}", workers.connected));
             }
             None => {}
         }
@@ -101,6 +113,20 @@ impl Display for Bars {
         // As above.
         let _ = self.all.clear();
     }
+}
+
+/// No bar without a total, no estimate before the first step or after the last.
+fn advance(bar: &ProgressBar, lead: &str, done: u64, total: u64) {
+    let template = match (done, total) {
+        (_, 0) => format!("{lead} {{prefix:<14}} {{msg}}"),
+        (done, total) if done == 0 || done >= total => {
+            format!("{lead} {{prefix:<14}} {{bar:30}} {{pos}}/{{len}} {{msg}}")
+        }
+        _ => format!("{lead} {{prefix:<14}} {{bar:30}} {{pos}}/{{len}} {{msg}}  {{eta}} left"),
+    };
+    bar.set_style(style(&template));
+    bar.set_length(total);
+    bar.set_position(done);
 }
 
 fn style(template: &str) -> ProgressStyle {

@@ -323,17 +323,16 @@ pub fn view_metrics(name: &str, rendered: &Image, truth: &Image, moving: Option<
     }
 }
 
-/// Mean over views, named `mean`; `None` without views.
-pub fn mean(views: &[ViewMetrics]) -> Option<ViewMetrics> {
-    if views.is_empty() {
-        return None;
-    }
-    let average = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-    let moving: Vec<f64> = views.iter().filter_map(|view| view.moving_psnr).collect();
+/// Mean over views or frames, named `mean`; the moving region's over those that have one. `None` of none.
+pub fn mean<'a>(metrics: impl IntoIterator<Item = &'a ViewMetrics>) -> Option<ViewMetrics> {
+    let metrics: Vec<_> = metrics.into_iter().collect();
+    let average =
+        |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
+    let moving: Vec<f64> = metrics.iter().filter_map(|view| view.moving_psnr).collect();
     Some(ViewMetrics {
         view: "mean".to_owned(),
-        psnr: average(&views.iter().map(|view| view.psnr).collect::<Vec<_>>()),
-        ssim: average(&views.iter().map(|view| view.ssim).collect::<Vec<_>>()),
-        moving_psnr: (!moving.is_empty()).then(|| average(&moving)),
+        psnr: average(&metrics.iter().map(|view| view.psnr).collect::<Vec<_>>())?,
+        ssim: average(&metrics.iter().map(|view| view.ssim).collect::<Vec<_>>())?,
+        moving_psnr: average(&moving),
     })
 }
