@@ -14,6 +14,7 @@ mod colour;
 mod engine;
 pub mod footprint_moments;
 mod lanes;
+mod pass;
 pub mod project;
 pub mod project_backward;
 mod session;
@@ -21,6 +22,7 @@ mod session;
 mod tests;
 
 pub use engine::{CpuEngine, render, render_backward};
+pub use pass::Pass;
 
 /// Points nearer than this to the principal plane are not drawn, in world units.
 pub const NEAR_PLANE: f64 = 0.01;

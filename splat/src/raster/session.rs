@@ -1,6 +1,6 @@
 //! An optimisation session of the CPU engine: parameters, optimiser state, images and buffers live as long as it does.
 
-use super::engine::{Pass, scatter};
+use super::pass::Pass;
 use crate::{
     cameras::Camera,
     engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
@@ -84,21 +84,17 @@ impl Session for CpuSession {
             &mut [],
         );
         let value = loss.evaluate(&self.rendered, &mut self.workspace, &mut self.image_gradient);
-        let by_footprint = self.pass.backward(self.background, &self.image_gradient, &[], &self.active);
+        self.pass.blend_backward(self.background, &self.image_gradient, &[], &self.active);
         self.gradients.clear();
-        let geometry = scatter(
+        self.pass.project_backward(
             &self.gaussians,
             camera,
             rates.sh_degree,
-            &self.pass.bins,
-            &by_footprint,
             &self.active,
             &mut self.gradients,
         );
         let half_size = [camera.width as f32 / 2.0, camera.height as f32 / 2.0];
-        for (footprint, gradient) in self.pass.bins.footprints.iter().zip(&geometry) {
-            let [x, y] = gradient.projected_mean;
-            let index = footprint.index as usize;
+        for (index, [x, y]) in self.pass.visible() {
             self.density.gradient_norm[index] += (x * half_size[0]).hypot(y * half_size[1]);
             self.density.visible_steps[index] += 1;
         }
