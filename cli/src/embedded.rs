@@ -78,7 +78,7 @@ impl EmbeddedRun<'_> {
             dismiss_workers_when_idle: self.workers > 0,
             ..ServeOptions::default()
         };
-        Ok(serve(options, Arc::new(CpuEngine), shutdown.clone()).await?)
+        Ok(serve(options, Arc::new(CpuEngine::default()), shutdown.clone()).await?)
     }
 
     async fn work(

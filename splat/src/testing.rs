@@ -4,7 +4,17 @@ use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{cameras::Camera, gaussians::Gaussians};
+use crate::{
+    cameras::Camera,
+    engine::{Engine, Rendering},
+    gaussians::Gaussians,
+    raster::CpuEngine,
+};
+
+/// What the CPU engine draws.
+pub(crate) fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Rendering {
+    CpuEngine::default().render(gaussians, camera, background).expect("the CPU engine draws everything")
+}
 
 /// Cameras on an arc of 60°, four units from the origin, looking at it.
 pub(crate) fn arc(count: usize, width: u32, height: u32) -> Vec<Camera> {

@@ -6,7 +6,8 @@
 )]
 
 use splat::{
-    raster::{render, render_backward},
+    engine::Engine,
+    raster::{CpuEngine, Instructions},
     tracking::TrackField,
 };
 use trackersplat_tests::golden::{Golden, largest_difference, relative_norm};
@@ -20,11 +21,15 @@ const IMAGE_TOLERANCE: f64 = 2e-5;
 /// Relative norm per gradient array in single precision.
 const GRADIENT_TOLERANCE: f64 = 1e-4;
 
-fn for_each_golden(check: impl Fn(&str, &Golden)) {
+/// Every scene with every instruction set of this machine.
+fn for_each_golden(check: impl Fn(&str, &Golden, CpuEngine)) {
     for scene in SCENES {
         for camera in 0..2 {
             let name = format!("raster_{scene}_cam{camera}");
-            check(&name, &Golden::open(&name));
+            let golden = Golden::open(&name);
+            for instructions in Instructions::available() {
+                check(&format!("{name} {}", instructions.set()), &golden, CpuEngine::new(instructions));
+            }
         }
     }
 }
@@ -39,8 +44,8 @@ fn background(golden: &Golden) -> [f32; 3] {
 
 #[test]
 fn images_match_the_dense_reference() {
-    for_each_golden(|name, golden| {
-        let rendering = render(&golden.gaussians(), &golden.camera(), background(golden));
+    for_each_golden(|name, golden, engine| {
+        let rendering = engine.render(&golden.gaussians(), &golden.camera(), background(golden)).unwrap();
         let image = largest_difference(wide(&rendering.image.pixels), golden.values("image"));
         let alpha = largest_difference(wide(&rendering.alpha), golden.values("alpha"));
         println!("{name}: image {image:.1e}, alpha {alpha:.1e}");
@@ -51,10 +56,10 @@ fn images_match_the_dense_reference() {
 
 #[test]
 fn gradients_match_automatic_differentiation() {
-    for_each_golden(|name, golden| {
+    for_each_golden(|name, golden, engine| {
         let image_seed: Vec<f32> = golden.values("seed_image").iter().map(|&value| value as f32).collect();
         let alpha_seed: Vec<f32> = golden.values("seed_alpha").iter().map(|&value| value as f32).collect();
-        let gradients = render_backward(
+        let gradients = engine.render_backward(
             &golden.gaussians(),
             &golden.camera(),
             background(golden),
@@ -78,7 +83,7 @@ fn gradients_match_automatic_differentiation() {
 
 #[test]
 fn blending_weights_of_a_footprint_match() {
-    for_each_golden(|name, golden| {
+    for_each_golden(|name, golden, engine| {
         let camera = golden.camera();
         let pixels = camera.width as usize * camera.height as usize;
         let tracks = TrackField {
@@ -88,9 +93,7 @@ fn blending_weights_of_a_footprint_match() {
             visible: vec![true; pixels],
             sigma: vec![1.0; pixels],
         };
-        let engine = splat::raster::CpuEngine;
-        let moments =
-            splat::engine::Engine::footprint_moments(&engine, &golden.gaussians(), &camera, &tracks).unwrap();
+        let moments = engine.footprint_moments(&golden.gaussians(), &camera, &tracks).unwrap();
         let error = relative_norm(moments.iter().map(|m| m.blend_weight), golden.values("weight_sum"));
         assert!(error < 1e-5, "{name}: weights off by {error:e}");
     });
@@ -112,9 +115,7 @@ fn footprint_moments_match_on_every_track_field() {
             visible: vec![true; camera.width as usize * camera.height as usize],
             sigma: vec![1.0; camera.width as usize * camera.height as usize],
         };
-        let engine = splat::raster::CpuEngine;
-        let moments =
-            splat::engine::Engine::footprint_moments(&engine, &golden.gaussians(), &camera, &tracks).unwrap();
+        let moments = CpuEngine::default().footprint_moments(&golden.gaussians(), &camera, &tracks).unwrap();
         let golden_pixels = golden.values("pixel_count");
         for (index, found) in moments.iter().enumerate() {
             assert_eq!(f64::from(found.pixels), golden_pixels[index], "{field}: pixels of Gaussian {index}");

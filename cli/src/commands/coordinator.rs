@@ -53,7 +53,7 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
         max_attempts: args.max_attempts,
         dismiss_workers_when_idle: false,
     };
-    let running = serve(options, Arc::new(CpuEngine), interrupted).await?;
+    let running = serve(options, Arc::new(CpuEngine::default()), interrupted).await?;
     // For scripts that let the system choose the port.
     stdout::line(format_args!("http://{}", running.address));
     Ok(running.finished().await?)

@@ -39,7 +39,7 @@ fn cpu() -> Device {
     // Linux only; elsewhere the architecture has to do.
     let processors = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = model_name(&processors).unwrap_or(std::env::consts::ARCH).to_owned();
-    Device { engine: CpuEngine.name().to_owned(), name, threads: cores(), features: simd() }
+    Device { engine: CpuEngine::default().name().to_owned(), name, threads: cores(), features: simd() }
 }
 
 fn model_name(processors: &str) -> Option<&str> {

@@ -118,7 +118,7 @@ fn measure(
     for (position, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Test) {
         let truth = clip.image(position, index).map_err(bad_clip)?;
         let mask = clip.mask(position, index).map_err(bad_clip)?;
-        let rendering = CpuEngine.render(&gaussians, &view.camera, sequence.settings.background);
+        let rendering = CpuEngine::default().render(&gaussians, &view.camera, sequence.settings.background);
         let mut image = rendering.map_err(|error| CliError::failed(&view.name, error))?.image;
         // What a viewer shows.
         image.pixels.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));

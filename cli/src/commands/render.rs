@@ -43,7 +43,7 @@ pub(super) fn run(args: RenderArgs) -> Result<(), CliError> {
         )
     })?;
     let gaussians = read_frame(&args.dir, frame)?;
-    let rendering = CpuEngine.render(&gaussians, &view.camera, sequence.settings.background);
+    let rendering = CpuEngine::default().render(&gaussians, &view.camera, sequence.settings.background);
     let image = rendering.map_err(|error| CliError::failed("rendering", error))?.image;
     std::fs::write(&args.out, image.encode_png())
         .map_err(|error| CliError::bad_input(args.out.display(), error))?;

@@ -45,7 +45,7 @@ pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
         reconnect_for: args.reconnect_for,
         remote_blobs: args.remote_blobs,
     };
-    match trackersplat_worker::run(options, Arc::new(CpuEngine), interrupt::token()?).await {
+    match trackersplat_worker::run(options, Arc::new(CpuEngine::default()), interrupt::token()?).await {
         Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
         Err(
             error @ (WorkerError::BadAddress(_)

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::{
-    raster::{CpuEngine, render},
-    testing::{arc, blobs, on_threads},
+    raster::CpuEngine,
+    testing::{arc, blobs, on_threads, render},
 };
 
 const BLACK: [f32; 3] = [0.0; 3];
@@ -69,7 +69,7 @@ fn go_on(_: FrameProgress) -> ControlFlow<()> {
 fn the_key_frame_is_evaluated_and_left_alone() {
     let mut input = input(&blobs(60, 1), [0.0; 2]);
     input.is_key_frame = true;
-    let result = reconstruct_frame(&CpuEngine, &input, &mut go_on).unwrap();
+    let result = reconstruct_frame(&CpuEngine::default(), &input, &mut go_on).unwrap();
     assert_eq!(result.gaussians, *input.static_model);
     assert_eq!(result.report.before, result.report.after);
     assert_eq!(result.report.after.last().unwrap().view, "mean");
@@ -79,13 +79,13 @@ fn the_key_frame_is_evaluated_and_left_alone() {
 #[test]
 fn tracks_move_the_model_before_refinement() {
     let input = input(&lowered(), [0.0, 2.0]);
-    let result = reconstruct_frame(&CpuEngine, &input, &mut go_on).unwrap();
+    let result = reconstruct_frame(&CpuEngine::default(), &input, &mut go_on).unwrap();
     assert!(!result.report.rolled_back);
     let solved = result.report.motion.solved;
     assert!(solved > 30, "{:?}", result.report.motion);
     let mut still = input.clone();
     still.settings.motion_source = MotionSource::None;
-    let without = reconstruct_frame(&CpuEngine, &still, &mut go_on).unwrap();
+    let without = reconstruct_frame(&CpuEngine::default(), &still, &mut go_on).unwrap();
     let gain = result.report.before[0].psnr - without.report.before[0].psnr;
     assert!(gain > 3.0, "{gain} dB better than no motion");
     assert_eq!(without.report.motion, MotionCounts::default());
@@ -94,7 +94,7 @@ fn tracks_move_the_model_before_refinement() {
 #[test]
 fn motion_that_renders_worse_is_undone() {
     let input = input(&blobs(60, 1), [0.0, 6.0]);
-    let result = reconstruct_frame(&CpuEngine, &input, &mut go_on).unwrap();
+    let result = reconstruct_frame(&CpuEngine::default(), &input, &mut go_on).unwrap();
     assert!(result.report.rolled_back);
     assert_eq!(result.report.before[0].psnr, metrics::PSNR_CAP, "it starts from the key frame");
 }
@@ -102,7 +102,7 @@ fn motion_that_renders_worse_is_undone() {
 #[test]
 fn resting_tracks_leave_every_gaussian_static() {
     let input = input(&blobs(60, 1), [0.0; 2]);
-    let result = reconstruct_frame(&CpuEngine, &input, &mut go_on).unwrap();
+    let result = reconstruct_frame(&CpuEngine::default(), &input, &mut go_on).unwrap();
     let counts = result.report.motion;
     assert_eq!((counts.solved, counts.propagated), (0, 0), "{counts:?}");
 }
@@ -110,7 +110,9 @@ fn resting_tracks_leave_every_gaussian_static() {
 #[test]
 fn any_number_of_threads_gives_the_same_bytes() {
     let input = input(&lowered(), [0.0, 2.0]);
-    let run = |threads| on_threads(threads, || reconstruct_frame(&CpuEngine, &input, &mut go_on).unwrap());
+    let run = |threads| {
+        on_threads(threads, || reconstruct_frame(&CpuEngine::default(), &input, &mut go_on).unwrap())
+    };
     let (one, three) = (run(1), run(3));
     assert_eq!(one.gaussians, three.gaussians);
     assert_eq!(one.report, three.report);
@@ -122,7 +124,10 @@ fn it_stops_when_asked() {
     let mut stop = |progress: FrameProgress| {
         if progress.stage == "refine" { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
-    assert!(matches!(reconstruct_frame(&CpuEngine, &input, &mut stop), Err(FrameError::Cancelled)));
+    assert!(matches!(
+        reconstruct_frame(&CpuEngine::default(), &input, &mut stop),
+        Err(FrameError::Cancelled)
+    ));
 }
 
 #[test]
@@ -130,7 +135,7 @@ fn what_does_not_fit_is_bad_input() {
     let refused = |change: &dyn Fn(&mut FrameInput)| {
         let mut input = input(&lowered(), [0.0; 2]);
         change(&mut input);
-        matches!(reconstruct_frame(&CpuEngine, &input, &mut go_on), Err(FrameError::BadInput(_)))
+        matches!(reconstruct_frame(&CpuEngine::default(), &input, &mut go_on), Err(FrameError::BadInput(_)))
     };
     assert!(refused(&|input| input.training_views.clear()), "no view");
     assert!(refused(&|input| input.test_views[0].image = Arc::new(Image::filled(2, 2, BLACK))), "image");

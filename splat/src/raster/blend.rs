@@ -1,175 +1,187 @@
-//! Stage 3: front-to-back blending of a band's footprints, row by row.
+//! Stage 3: front-to-back blending of a band's footprints, block by block.
 
 use super::{
     ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
     bin::{BAND_ROWS, Bins},
-    lanes::{LANES, Simd, group_mut, simd_kernel},
-    project::Footprint,
+    blend_backward::Blended,
+    blocks::{BLOCK, BlockLists, Entry, corner, fill},
+    lanes::{Instructions, LANES, Simd, simd_kernel},
 };
 
-/// Pixel planes of one band; rows are padded by one group of lanes, padding never blends.
+/// What a band of rows of the image holds while a view is rendered and its gradient is taken.
 #[derive(Clone, Debug, Default)]
-pub struct Band {
+pub(super) struct Band {
+    pub lists: BlockLists,
     /// First image row.
     pub first_row: usize,
     /// Rows of the image in the band.
     pub rows: usize,
     /// Columns of the image.
     pub width: usize,
-    /// Floats per row of every plane.
-    pub stride: usize,
-    /// Transmittance left per pixel; negative once blending has stopped there.
-    pub transmittance: Vec<f32>,
-    /// Red, green and blue blended so far.
-    pub colour: [Vec<f32>; 3],
-    /// 1 + position in the band's entries of the last footprint that the pixel blended; 0: none. Single precision
-    /// counts exactly to 2²⁴, more entries than a band can hold in memory.
-    pub last: Vec<f32>,
+    /// Per block, transmittance left per pixel.
+    pub transmittance: Vec<[f32; LANES]>,
+    /// Per block and pixel, how many footprints of the block's list came before blending stopped.
+    /// Single precision counts exactly to 2²⁴, more than a block's list can hold in memory.
+    pub last: Vec<[f32; LANES]>,
+    /// What the list of the block at hand did, while it is replayed.
+    pub blended: Vec<Blended>,
+    /// Per entry of the lists, the gradient's sums.
+    pub sums: Vec<Sums>,
 }
+
+/// Sums over the pixels of a band that make a footprint's gradient, see `FootprintGradient`; the last three are not
+/// used.
+pub(super) type Sums = [f32; 12];
 
 impl Band {
-    /// Prepares the planes of band `band` of a `width × height` image.
-    pub fn reset(&mut self, band: usize, width: usize, height: usize) {
-        self.first_row = band * BAND_ROWS;
+    /// Prepares band `number` of a `width × height` image: lists its footprints per block.
+    pub(super) fn reset(
+        &mut self,
+        instructions: Instructions,
+        bins: &Bins,
+        number: usize,
+        width: usize,
+        height: usize,
+        active: &[bool],
+    ) {
+        self.first_row = number * BAND_ROWS;
         self.rows = BAND_ROWS.min(height - self.first_row);
         self.width = width;
-        self.stride = width + LANES;
-        let size = self.stride * self.rows;
-        // Padding starts stopped, so that no lane beyond the border ever blends.
-        self.transmittance.clear();
-        self.transmittance.resize(size, -1.0);
-        for row in 0..self.rows {
-            self.transmittance[row * self.stride..row * self.stride + width].fill(1.0);
-        }
-        for plane in &mut self.colour {
-            plane.clear();
-            plane.resize(size, 0.0);
-        }
-        self.last.clear();
-        self.last.resize(size, 0.0);
+        fill(instructions, &mut self.lists, bins, number, width, height, active);
+        // Every block writes all of its values.
+        self.transmittance.resize(self.lists.blocks(), [0.0; LANES]);
+        self.last.resize(self.lists.blocks(), [0.0; LANES]);
+    }
+
+    /// Lane and place within the band of each of a block's pixels that lie in the image.
+    pub(super) fn pixels(&self, block: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
+        let (column, row) = corner(block);
+        let (width, columns) = (self.width, BLOCK.min(self.width.saturating_sub(column)));
+        let rows = BLOCK.min(self.rows.saturating_sub(row));
+        (0..rows)
+            .flat_map(move |y| (0..columns).map(move |x| (y * BLOCK + x, (row + y) * width + column + x)))
     }
 }
 
-/// One footprint on one row: alpha at column `x` is `2^(peak - curvature · (x + 0.5 - centre)²)`.
+/// Entries whose alphas are computed before the first of them is blended: alphas do not depend on each other, blending
+/// does, and a processor overlaps the long chains of the former only if they stand close together.
+pub(super) const BATCH: usize = 16;
+
+/// Column and row of each lane within a block.
+pub(super) const COLUMNS: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
+const ROWS: [f32; LANES] = [0., 0., 0., 0., 1., 1., 1., 1., 2., 2., 2., 2., 3., 3., 3., 3.];
+
+/// A footprint seen from a block.
 #[derive(Clone, Copy)]
-pub(super) struct Span {
-    /// First column.
-    pub first: usize,
-    /// One past the last column.
-    pub end: usize,
-    /// Offset of the first column's centre from the row centre, pixels.
-    pub offset: f32,
-    /// Row minus mean, pixels.
+pub(super) struct Local {
+    /// Offset of the block's first pixel from the row centre of its row.
+    pub d: f32,
+    /// Offset of the block's first row from the mean.
     pub dy: f32,
-    /// Logarithm to base 2 of alpha at the row centre.
-    pub peak: f32,
-    /// Half the inverse variance along the row, in units of base-2 exponents.
-    pub curvature: f32,
+    /// Row centre shift per row.
+    pub slope: f32,
 }
 
-impl Span {
-    /// Alpha before the clamp of the group whose first column lies `offset` from the row centre.
+impl Local {
+    /// `x, y`: centre of the block's first pixel. In double precision, as a needle's row centre is a small difference
+    /// of large numbers.
     #[inline(always)]
-    pub(super) fn alpha<S: Simd>(&self, offset: f32) -> S {
-        let d = S::ramp().add(S::splat(offset));
-        d.mul(d).mul_add(S::splat(-self.curvature), S::splat(self.peak)).exp2()
+    pub(super) fn new(entry: &Entry, x: f64, y: f64) -> Self {
+        let dy = y - entry.mean[1];
+        let d = (x - entry.mean[0]) - entry.slope * dy;
+        Self { d: d as f32, dy: dy as f32, slope: entry.slope as f32 }
     }
-}
 
-/// The columns of image row `row` on which the footprint's alpha can reach [`ALPHA_MIN`].
-#[inline(always)]
-pub(super) fn span(footprint: &Footprint, row: usize, width: usize) -> Option<Span> {
-    let dy = row as f64 + 0.5 - footprint.mean[1];
-    let fall = 0.5 * dy * dy * footprint.inverse_yy;
-    let left = footprint.reach - fall;
-    if !(left >= 0.0) {
-        return None;
+    /// Alpha of the block's pixels before the clamp.
+    #[inline(always)]
+    pub(super) fn alpha<S: Simd>(&self, entry: &Entry) -> S {
+        let d = S::load(&ROWS).mul_add(S::splat(-self.slope), S::load(&COLUMNS).add(S::splat(self.d)));
+        let dy = S::load(&ROWS).add(S::splat(self.dy));
+        let across = dy.mul(S::splat(-entry.fall)).mul_add(dy, S::splat(entry.peak));
+        d.mul(S::splat(-entry.curvature)).mul_add(d, across).exp2()
     }
-    let centre = footprint.mean[0] + footprint.slope * dy;
-    // The margin covers the rounding of the kernel's alpha; the kernel itself decides at the threshold.
-    let half = (2.0 * left / footprint.inverse_conditional).sqrt() * (1.0 + 1e-6) + 1e-3;
-    let low = (centre - half - 0.5).ceil().max(0.0);
-    let high = (centre + half - 0.5).floor().min(width as f64 - 1.0);
-    if !(low <= high) {
-        return None;
-    }
-    Some(Span {
-        first: low as usize,
-        end: high as usize + 1,
-        offset: (low + 0.5 - centre) as f32,
-        dy: dy as f32,
-        peak: ((footprint.log_opacity - fall) * std::f64::consts::LOG2_E) as f32,
-        curvature: (0.5 * footprint.inverse_conditional * std::f64::consts::LOG2_E) as f32,
-    })
-}
-
-/// The image rows of the band that the footprint can reach.
-#[inline(always)]
-pub(super) fn rows(footprint: &Footprint, band_first: usize, band_rows: usize) -> std::ops::Range<usize> {
-    let half = (2.0 * footprint.reach / footprint.inverse_yy).sqrt();
-    let low = (footprint.mean[1] - half - 0.5).ceil().max(band_first as f64) as usize;
-    let high =
-        (footprint.mean[1] + half + 0.5).floor().min((band_first + band_rows) as f64).max(0.0) as usize;
-    low..high
 }
 
 simd_kernel! {
-    /// Blends all footprints of `band` front to back.
-    pub fn blend(bins: &Bins, number: usize, band: &mut Band) = blend_kernel
+    /// Blends all footprints of a band front to back into `pixels`, the band's rows of the image, `rows × width × 3`,
+    /// and `alpha`, `rows × width` or empty.
+    pub(super) fn blend(band: &mut Band, background: [f32; 3], pixels: &mut [f32], alpha: &mut [f32]) = blend_kernel
 }
 
 #[inline(always)]
-fn blend_kernel<S: Simd>(bins: &Bins, number: usize, band: &mut Band) {
-    for (place, &position) in bins.band(number).iter().enumerate() {
-        let footprint = &bins.footprints[position as usize];
-        for row in rows(footprint, band.first_row, band.rows) {
-            let Some(span) = span(footprint, row, band.width) else { continue };
-            let row_start = (row - band.first_row) * band.stride;
-            let mut offset = span.offset;
-            let mut first = span.first;
-            while first < span.end {
-                blend_group::<S>(
-                    band,
-                    row_start + first,
-                    offset,
-                    &span,
-                    footprint.colour,
-                    (place + 1) as f32,
-                );
-                first += LANES;
-                offset += LANES as f32;
+fn blend_kernel<S: Simd>(band: &mut Band, background: [f32; 3], pixels: &mut [f32], alpha: &mut [f32]) {
+    for block in 0..band.lists.blocks() {
+        let mut is_inside = [0.0; LANES];
+        band.pixels(block).for_each(|(lane, _)| is_inside[lane] = 1.0);
+        let (column, row) = corner(block);
+        let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
+        let blended = blend_block::<S>(&band.lists.entries, band.lists.of(block), x, y, &is_inside);
+        band.transmittance[block] = blended.transmittance;
+        band.last[block] = blended.last;
+        for (lane, place) in band.pixels(block) {
+            let transmittance = blended.transmittance[lane];
+            for channel in 0..3 {
+                pixels[3 * place + channel] =
+                    blended.colour[channel][lane] + transmittance * background[channel];
+            }
+            if let Some(value) = alpha.get_mut(place) {
+                *value = 1.0 - transmittance;
             }
         }
     }
 }
 
+struct BlockResult {
+    colour: [[f32; LANES]; 3],
+    transmittance: [f32; LANES],
+    last: [f32; LANES],
+}
+
+/// Blends the listed entries over one block; lanes that are not inside the image blend nothing.
 #[inline(always)]
-fn blend_group<S: Simd>(
-    band: &mut Band,
-    first: usize,
-    offset: f32,
-    span: &Span,
-    colour: [f32; 3],
-    mark: f32,
-) {
-    let transmittance = group_mut(&mut band.transmittance, first);
-    let before = S::load(transmittance);
-    let alpha = span.alpha::<S>(offset).min(S::splat(ALPHA_MAX));
-    let zero = S::splat(0.0);
-    let hit = S::both(alpha.ge(S::splat(ALPHA_MIN)), zero.lt(before));
-    if !S::any(hit) {
-        return;
+fn blend_block<S: Simd>(
+    entries: &[Entry],
+    list: &[u32],
+    x: f64,
+    y: f64,
+    is_inside: &[f32; LANES],
+) -> BlockResult {
+    let (zero, one, least) = (S::splat(0.0), S::splat(1.0), S::splat(TRANSMITTANCE_MIN));
+    // Goes on falling where blending has stopped, and never rises: blending has stopped wherever it is below the least.
+    let mut running = S::load(is_inside);
+    let mut transmittance = one;
+    let mut colour = [zero; 3];
+    let (mut place, mut last) = (zero, zero);
+    let mut alphas = [zero; BATCH];
+    for batch in list.chunks(BATCH) {
+        for (alpha, &entry) in alphas.iter_mut().zip(batch) {
+            let entry = &entries[entry as usize];
+            let value = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
+            *alpha = S::select(value.ge(S::splat(ALPHA_MIN)), value, zero);
+        }
+        for (&alpha, &entry) in alphas.iter().zip(batch) {
+            let entry = &entries[entry as usize];
+            let weight = running.mul(alpha);
+            running = running.sub(weight);
+            let blends = running.ge(least);
+            transmittance = S::select(blends, running, transmittance);
+            place = place.add(one);
+            last = S::select(blends, place, last);
+            let weight = S::select(blends, weight, zero);
+            for channel in 0..3 {
+                colour[channel] = weight.mul_add(S::splat(entry.colour[channel]), colour[channel]);
+            }
+        }
+        if !S::any(running.ge(least)) {
+            break;
+        }
     }
-    let weight = before.mul(alpha);
-    let after = before.sub(weight);
-    let blends = S::both(hit, after.ge(S::splat(TRANSMITTANCE_MIN)));
-    let stopped = S::select(hit, zero.sub(before), before);
-    S::select(blends, after, stopped).store(transmittance);
-    let weight = S::select(blends, weight, zero);
-    for (plane, value) in band.colour.iter_mut().zip(colour) {
-        let plane = group_mut(plane, first);
-        weight.mul_add(S::splat(value), S::load(plane)).store(plane);
+    let mut blended =
+        BlockResult { colour: [[0.0; LANES]; 3], transmittance: [0.0; LANES], last: [0.0; LANES] };
+    for (values, to) in colour.into_iter().zip(&mut blended.colour) {
+        values.store(to);
     }
-    let last = group_mut(&mut band.last, first);
-    S::select(blends, S::splat(mark), S::load(last)).store(last);
+    transmittance.store(&mut blended.transmittance);
+    last.store(&mut blended.last);
+    blended
 }

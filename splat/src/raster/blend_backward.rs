@@ -1,21 +1,29 @@
-//! Stage 4: the gradient of blending, by replay from back to front.
+//! Stage 4: the gradient of blending, replayed block by block.
 //!
-//! Nothing is stored per pixel and footprint. From the final transmittance `T` and the light that arrives from behind,
-//! `behind = Σ_later w_j (c_j · g) + T_final (background · g - g_alpha)` with `g` the gradient of the loss by the
-//! pixel's colour, each step recovers the transmittance before a footprint as `T / (1 - alpha)`, which is safe as
-//! alpha never exceeds [`ALPHA_MAX`].
+//! Nothing is stored per pixel and footprint beyond one block at a time. A first loop over the block's list repeats the
+//! blending, front to back, and keeps each footprint's alpha and weight; so every transmittance is what it was in the
+//! forward pass. A second loop goes back to front with the light behind each footprint, seen through nothing else:
+//! with `g` the gradient of the loss by the pixel's colour,
+//!
+//! ```text
+//! behind_last = background · g - g_alpha
+//! behind_(i-1) = behind_i + alpha_i (c_i · g - behind_i)
+//! ∂loss/∂alpha_i = T_i (c_i · g - behind_i)
+//! ```
+//!
+//! It divides by nothing, so an opaque footprint is as safe as a faint one.
 
 use super::{
     ALPHA_MAX, ALPHA_MIN,
-    bin::Bins,
-    blend::{Band, Span, rows, span},
-    lanes::{LANES, Simd, group, group_mut, simd_kernel},
+    blend::{Band, COLUMNS, Local, Sums},
+    blocks::{Entry, corner},
+    lanes::{Group, LANES, ROWS, Simd, simd_kernel},
 };
 
-/// Gradient of the loss by one footprint, from one band or summed over bands.
+/// Gradient of the loss by one footprint.
 ///
-/// With `v = alpha · ∂loss/∂alpha` and `d` the offset from the row centre, the moments of `v` suffice for the
-/// footprint's position and shape.
+/// With `v = alpha · ∂loss/∂alpha`, `d` the offset from the row centre and `dy` that from the mean's row, the moments of
+/// `v` suffice for the footprint's position and shape.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct FootprintGradient {
     /// `Σ v`: by the logarithm of the opacity.
@@ -35,226 +43,206 @@ pub struct FootprintGradient {
 }
 
 impl FootprintGradient {
-    /// Adds another band's share.
-    pub fn add(&mut self, other: &Self) {
-        self.v += other.v;
-        self.v_d += other.v_d;
-        self.v_dd += other.v_dd;
-        self.v_y += other.v_y;
-        self.v_dy += other.v_dy;
-        self.v_yy += other.v_yy;
-        for channel in 0..3 {
-            self.colour[channel] += other.colour[channel];
-        }
-    }
-}
-
-/// Planes of the replay, beside those of the [`Band`].
-#[derive(Clone, Debug, Default)]
-pub struct Replay {
-    /// Gradient of the loss by red, green and blue.
-    pub gradient: [Vec<f32>; 3],
-    /// Transmittance behind the footprint at hand.
-    pub transmittance: Vec<f32>,
-    /// Light from behind, weighted with the gradient.
-    pub behind: Vec<f32>,
-}
-
-impl Replay {
-    /// Starts the replay of a blended band: `image_gradient` is `H × W × 3`, `alpha_gradient` `H × W` or empty.
-    pub fn reset(
-        &mut self,
-        band: &Band,
-        background: [f32; 3],
-        image_gradient: &[f32],
-        alpha_gradient: &[f32],
-    ) {
-        let size = band.stride * band.rows;
-        for plane in self.gradient.iter_mut().chain([&mut self.transmittance, &mut self.behind]) {
-            plane.clear();
-            plane.resize(size, 0.0);
-        }
-        for row in 0..band.rows {
-            for x in 0..band.width {
-                let (place, pixel) = (row * band.stride + x, (band.first_row + row) * band.width + x);
-                let transmittance = band.transmittance[place].abs();
-                let mut from_background = -alpha_gradient.get(pixel).copied().unwrap_or(0.0);
-                for channel in 0..3 {
-                    let gradient = image_gradient[3 * pixel + channel];
-                    self.gradient[channel][place] = gradient;
-                    from_background += gradient * background[channel];
-                }
-                self.transmittance[place] = transmittance;
-                self.behind[place] = transmittance * from_background;
-            }
+    /// Adds a band's share.
+    pub(super) fn add(&mut self, sums: &Sums) {
+        let [v, v_d, v_dd, v_y, v_dy, v_yy, red, green, blue, ..] = sums.map(f64::from);
+        self.v += v;
+        self.v_d += v_d;
+        self.v_dd += v_dd;
+        self.v_y += v_y;
+        self.v_dy += v_dy;
+        self.v_yy += v_yy;
+        for (sum, value) in self.colour.iter_mut().zip([red, green, blue]) {
+            *sum += value;
         }
     }
 }
 
 simd_kernel! {
-    /// Gradients of the entries of band `number`, one per entry; those of Gaussians that are not `active` (empty: all
-    /// are) stay zero, but their light is taken out all the same.
-    pub fn blend_backward(
-        bins: &Bins,
-        number: usize,
-        band: &Band,
-        active: &[bool],
-        replay: &mut Replay,
-        gradients: &mut [FootprintGradient],
+    /// Fills the band's sums. `gradient` is that of the image's values in the band's rows, `rows × width × 3`,
+    /// `alpha_gradient` `rows × width` or empty. Sums of entries that are not active stay zero, but their light is taken
+    /// out all the same.
+    pub(super) fn blend_backward(
+        band: &mut Band,
+        background: [f32; 3],
+        gradient: &[f32],
+        alpha_gradient: &[f32],
     ) = backward_kernel
 }
 
 #[inline(always)]
-fn backward_kernel<S: Simd>(
-    bins: &Bins,
-    number: usize,
-    band: &Band,
-    active: &[bool],
-    replay: &mut Replay,
-    gradients: &mut [FootprintGradient],
-) {
-    for (place, &position) in bins.band(number).iter().enumerate().rev() {
-        let footprint = &bins.footprints[position as usize];
-        let is_active = active.get(footprint.index as usize).copied().unwrap_or(true);
-        let place_mark = S::splat(place as f32);
-        let mut sums = Sums::<S>::zero();
-        for row in rows(footprint, band.first_row, band.rows) {
-            let Some(span) = span(footprint, row, band.width) else { continue };
-            let row_start = (row - band.first_row) * band.stride;
-            let mut row_sums = RowSums::<S>::zero();
-            let mut offset = span.offset;
-            let mut first = row_start + span.first;
-            while first < row_start + span.end {
-                let undone =
-                    undo::<S>(&band.last, replay, first, offset, &span, footprint.colour, place_mark);
-                if let Some(undone) = undone
-                    && is_active
-                {
-                    row_sums.add(&undone, offset);
-                    sums.add_colour(&undone, &replay.gradient, first);
-                }
-                first += LANES;
-                offset += LANES as f32;
+fn backward_kernel<S: Simd>(band: &mut Band, background: [f32; 3], gradient: &[f32], alpha_gradient: &[f32]) {
+    band.sums.clear();
+    band.sums.resize(band.lists.entries.len(), [0.0; 12]);
+    for block in 0..band.lists.blocks() {
+        let mut replay = Replay::default();
+        for (lane, place) in band.pixels(block) {
+            let mut from_background = -alpha_gradient.get(place).copied().unwrap_or(0.0);
+            for channel in 0..3 {
+                let gradient = gradient[3 * place + channel];
+                replay.colour_gradient[channel][lane] = gradient;
+                from_background += gradient * background[channel];
             }
-            sums.add_row(&row_sums, span.dy);
+            replay.behind[lane] = from_background;
         }
-        gradients[place] = if is_active { sums.reduce() } else { FootprintGradient::default() };
+        let (column, row) = corner(block);
+        let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
+        let last = &band.last[block];
+        let deepest = last.iter().fold(0.0, |deepest: f32, &place| deepest.max(place)) as usize;
+        let list = &band.lists.of(block)[..deepest];
+        blend_again::<S>(&band.lists.entries, list, last, x, y, &mut band.blended);
+        replay_block::<S>(&band.lists.entries, list, x, y, &replay, &band.blended, &mut band.sums);
     }
 }
 
-/// What one footprint did to a group of pixels.
-struct Undone<S> {
-    weight: S,
-    /// `alpha · ∂loss/∂alpha`, zero where alpha was clamped.
-    v: S,
+/// What a block's replay starts from.
+#[derive(Default)]
+struct Replay {
+    colour_gradient: [[f32; LANES]; 3],
+    behind: [f32; LANES],
 }
 
-/// Takes a footprint's light out of a group of pixels; `None` if none of them blended it.
+/// What one footprint did to a block's pixels; zero where it was not blended.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Blended {
+    alpha: Group,
+    weight: Group,
+}
+
+/// Repeats the blending of a block's list.
 #[inline(always)]
-fn undo<S: Simd>(
-    last: &[f32],
-    replay: &mut Replay,
-    first: usize,
-    offset: f32,
-    span: &Span,
-    colour: [f32; 3],
-    place: S,
-) -> Option<Undone<S>> {
-    let unclamped = span.alpha::<S>(offset);
-    let largest = S::splat(ALPHA_MAX);
-    let alpha = unclamped.min(largest);
-    let blended = S::both(alpha.ge(S::splat(ALPHA_MIN)), place.lt(S::load(group(last, first))));
-    if !S::any(blended) {
-        return None;
+fn blend_again<S: Simd>(
+    entries: &[Entry],
+    list: &[u32],
+    last: &[f32; LANES],
+    x: f64,
+    y: f64,
+    blended: &mut Vec<Blended>,
+) {
+    blended.resize(list.len(), Blended::default());
+    let (zero, last) = (S::splat(0.0), S::load(last));
+    let mut transmittance = S::splat(1.0);
+    let mut place = zero;
+    for (blended, &entry) in blended.iter_mut().zip(list) {
+        let entry = &entries[entry as usize];
+        let alpha = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
+        let was_blended = S::both(alpha.ge(S::splat(ALPHA_MIN)), place.lt(last));
+        let alpha = S::select(was_blended, alpha, zero);
+        let weight = transmittance.mul(alpha);
+        transmittance = transmittance.sub(weight);
+        place = place.add(S::splat(1.0));
+        alpha.store(&mut blended.alpha.0);
+        weight.store(&mut blended.weight.0);
     }
+}
+
+#[inline(always)]
+fn replay_block<S: Simd>(
+    entries: &[Entry],
+    list: &[u32],
+    x: f64,
+    y: f64,
+    replay: &Replay,
+    blended: &[Blended],
+    sums: &mut [Sums],
+) {
     let zero = S::splat(0.0);
-    let alpha = S::select(blended, alpha, zero);
-    let inverse = S::splat(1.0).div(S::splat(1.0).sub(alpha));
-    let transmittance = group_mut(&mut replay.transmittance, first);
-    let before = S::load(transmittance).mul(inverse);
-    before.store(transmittance);
-    let weight = before.mul(alpha);
-    let [red, green, blue] = &replay.gradient;
-    let light = S::splat(colour[0]).mul_add(
-        S::load(group(red, first)),
-        S::splat(colour[1])
-            .mul_add(S::load(group(green, first)), S::splat(colour[2]).mul(S::load(group(blue, first)))),
-    );
-    let behind_plane = group_mut(&mut replay.behind, first);
-    let behind = S::load(behind_plane);
-    // ∂loss/∂alpha = T_before (c · g) - behind / (1 - alpha).
-    let v = weight.mul(light).sub(alpha.mul(behind).mul(inverse));
-    weight.mul_add(light, behind).store(behind_plane);
-    Some(Undone { weight, v: S::select(unclamped.lt(largest), v, zero) })
-}
-
-struct RowSums<S> {
-    v: S,
-    v_d: S,
-    v_dd: S,
-}
-
-impl<S: Simd> RowSums<S> {
-    #[inline(always)]
-    fn zero() -> Self {
-        let zero = S::splat(0.0);
-        Self { v: zero, v_d: zero, v_dd: zero }
-    }
-
-    #[inline(always)]
-    fn add(&mut self, undone: &Undone<S>, offset: f32) {
-        let d = S::ramp().add(S::splat(offset));
-        let v_d = undone.v.mul(d);
-        self.v = self.v.add(undone.v);
-        self.v_d = self.v_d.add(v_d);
-        self.v_dd = v_d.mul_add(d, self.v_dd);
-    }
-}
-
-struct Sums<S> {
-    row: RowSums<S>,
-    v_y: S,
-    v_dy: S,
-    v_yy: S,
-    colour: [S; 3],
-}
-
-impl<S: Simd> Sums<S> {
-    #[inline(always)]
-    fn zero() -> Self {
-        let zero = S::splat(0.0);
-        Self { row: RowSums::zero(), v_y: zero, v_dy: zero, v_yy: zero, colour: [zero; 3] }
-    }
-
-    #[inline(always)]
-    fn add_colour(&mut self, undone: &Undone<S>, gradient: &[Vec<f32>; 3], first: usize) {
-        for (sum, plane) in self.colour.iter_mut().zip(gradient) {
-            *sum = undone.weight.mul_add(S::load(group(plane, first)), *sum);
+    let [red, green, blue] = &replay.colour_gradient;
+    let g = [S::load(red), S::load(green), S::load(blue)];
+    let mut behind = S::load(&replay.behind);
+    let nothing = Share { entry: 0, weight: zero, v: zero };
+    let mut shares = [nothing; ROWS];
+    let mut count = 0;
+    for (blended, &number) in blended.iter().zip(list).rev() {
+        let entry = &entries[number as usize];
+        let (alpha, weight) = (S::load(&blended.alpha.0), S::load(&blended.weight.0));
+        let [red, green, blue] = entry.colour;
+        let light = S::splat(blue).mul(g[2]);
+        let light = S::splat(red).mul_add(g[0], S::splat(green).mul_add(g[1], light));
+        let excess = light.sub(behind);
+        behind = alpha.mul_add(excess, behind);
+        if !entry.is_active {
+            continue;
+        }
+        // Where alpha was clamped it follows nothing.
+        let v = S::select(alpha.lt(S::splat(ALPHA_MAX)), weight.mul(excess), zero);
+        shares[count] = Share { entry: number, weight, v };
+        count += 1;
+        if count == ROWS {
+            accumulate::<S>(sums, entries, &shares, x, y, &g);
+            count = 0;
         }
     }
-
-    #[inline(always)]
-    fn add_row(&mut self, row: &RowSums<S>, dy: f32) {
-        let dy = S::splat(dy);
-        let v_y = row.v.mul(dy);
-        self.row.v = self.row.v.add(row.v);
-        self.row.v_d = self.row.v_d.add(row.v_d);
-        self.row.v_dd = self.row.v_dd.add(row.v_dd);
-        self.v_y = self.v_y.add(v_y);
-        self.v_dy = row.v_d.mul_add(dy, self.v_dy);
-        self.v_yy = v_y.mul_add(dy, self.v_yy);
+    if count > 0 {
+        for share in &mut shares[count..] {
+            *share = nothing;
+        }
+        accumulate::<S>(sums, entries, &shares, x, y, &g);
     }
+}
 
-    #[inline(always)]
-    fn reduce(&self) -> FootprintGradient {
-        FootprintGradient {
-            v: self.row.v.sum().into(),
-            v_d: self.row.v_d.sum().into(),
-            v_dd: self.row.v_dd.sum().into(),
-            v_y: self.v_y.sum().into(),
-            v_dy: self.v_dy.sum().into(),
-            v_yy: self.v_yy.sum().into(),
-            colour: self.colour.map(|sum| sum.sum().into()),
+/// What one footprint gets from a block.
+#[derive(Clone, Copy)]
+struct Share<S> {
+    entry: u32,
+    weight: S,
+    /// `alpha · ∂loss/∂alpha`.
+    v: S,
+}
+
+/// Adds a block's shares to the sums of four entries, a row of lanes for each: first over the rows of the block, whose
+/// offsets are known, then over its columns.
+#[inline(always)]
+fn accumulate<S: Simd>(
+    sums: &mut [Sums],
+    entries: &[Entry],
+    shares: &[Share<S>; ROWS],
+    x: f64,
+    y: f64,
+    colour_gradient: &[S; 3],
+) {
+    // Per entry, the same in its four lanes, but for the column.
+    let (mut offset, mut dy, mut slope) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
+    for (row, share) in shares.iter().enumerate() {
+        let local = Local::new(&entries[share.entry as usize], x, y);
+        let lanes = ROWS * row..ROWS * (row + 1);
+        offset[lanes.clone()].fill(local.d);
+        dy[lanes.clone()].fill(local.dy);
+        slope[lanes].fill(-local.slope);
+    }
+    let (dy, against) = (S::load(&dy), S::load(&slope));
+    let across = S::load(&COLUMNS).add(S::load(&offset));
+    // Moments of v by the row within the block, per column.
+    let [a, b, c, d] = shares;
+    let [v0, v1, v2, v3] = S::transpose([a.v, b.v, c.v, d.v]);
+    let m0 = v0.add(v2).add(v1.add(v3));
+    let m1 = v3.mul_add(S::splat(3.0), v2.mul_add(S::splat(2.0), v1));
+    let m2 = v3.mul_add(S::splat(9.0), v2.mul_add(S::splat(4.0), v1));
+    // Of v by d and dy, with d = across - slope · row and dy = local.dy + row.
+    let v_d = m0.mul_add(across, m1.mul(against));
+    let v_d_row = m1.mul_add(across, m2.mul(against));
+    let v_dd = v_d.mul_add(across, v_d_row.mul(against));
+    let v_y = m0.mul_add(dy, m1);
+    let v_dy = v_d.mul_add(dy, v_d_row);
+    let v_y_row = m1.mul_add(dy, m2);
+    let v_yy = v_y.mul_add(dy, v_y_row);
+    let zero = S::splat(0.0);
+    let mut colour = [zero; 3];
+    for (sum, &g) in colour.iter_mut().zip(colour_gradient) {
+        let weighted = [a.weight.mul(g), b.weight.mul(g), c.weight.mul(g), d.weight.mul(g)];
+        let [w0, w1, w2, w3] = S::transpose(weighted);
+        *sum = w0.add(w2).add(w1.add(w3));
+    }
+    let [red, green, blue] = colour;
+    let parts = [[m0, v_d, v_dd, v_y], [v_dy, v_yy, red, green], [blue, zero, zero, zero]];
+    for (part, of_entries) in parts.into_iter().enumerate() {
+        let mut values = [0.0; LANES];
+        S::row_sums(of_entries).store(&mut values);
+        for (share, values) in shares.iter().zip(values.as_chunks::<ROWS>().0) {
+            let sums = &mut sums[share.entry as usize].as_chunks_mut::<ROWS>().0[part];
+            for (sum, value) in sums.iter_mut().zip(values) {
+                *sum += value;
+            }
         }
     }
 }

@@ -5,6 +5,7 @@ use glam::DVec3;
 use crate::gaussians::{Gaussians, sh};
 
 /// Direction from the camera centre to the mean; zero where they coincide, which leaves the degree-0 colour.
+#[inline(always)]
 fn direction_to(gaussians: &Gaussians, index: usize, centre: DVec3) -> (DVec3, f64) {
     let offset = gaussians.mean(index) - centre;
     let distance = offset.length();
@@ -12,6 +13,7 @@ fn direction_to(gaussians: &Gaussians, index: usize, centre: DVec3) -> (DVec3, f
 }
 
 /// Colour before the clamp at 0.
+#[inline(always)]
 fn unclamped(coefficients: &[f32], basis: &[f32; 16], count: usize) -> [f32; 3] {
     let mut colour = [0.5f32; 3];
     for (value, rgb) in basis[..count].iter().zip(coefficients.chunks_exact(3)) {
@@ -23,6 +25,7 @@ fn unclamped(coefficients: &[f32], basis: &[f32; 16], count: usize) -> [f32; 3] 
 }
 
 /// Colour of Gaussian `index` seen from `centre`, spherical harmonics up to `sh_degree`.
+#[inline(always)]
 pub(super) fn seen_from(gaussians: &Gaussians, index: usize, centre: DVec3, sh_degree: u32) -> [f32; 3] {
     let (direction, _) = direction_to(gaussians, index, centre);
     let degree = sh_degree.min(gaussians.sh_degree);
@@ -32,7 +35,8 @@ pub(super) fn seen_from(gaussians: &Gaussians, index: usize, centre: DVec3, sh_d
     colour.map(|value| if value < 0.0 { 0.0 } else { value })
 }
 
-/// Adds the gradient by the coefficients to `sh_gradient` (`K × 3`) and returns the gradient by the mean.
+/// Writes the gradient by the coefficients to `sh_gradient` (`K × 3`) and returns the gradient by the mean.
+#[inline(always)]
 pub(super) fn backward(
     gaussians: &Gaussians,
     index: usize,
@@ -46,16 +50,22 @@ pub(super) fn backward(
     let count = sh::coefficients(degree);
     let unit = direction.as_vec3().to_array();
     let basis = basis(unit, degree);
-    let coefficients = gaussians.sh_of(index);
+    let coefficients = &gaussians.sh_of(index)[..3 * count];
     let colour = unclamped(coefficients, &basis, count);
-    let passed: [f32; 3] =
-        std::array::from_fn(|channel| if colour[channel] >= 0.0 { colour_gradient[channel] } else { 0.0 });
-    let mut basis_gradient = [0.0f32; 16];
-    for k in 0..count {
-        for channel in 0..3 {
-            sh_gradient[3 * k + channel] += basis[k] * passed[channel];
-            basis_gradient[k] += coefficients[3 * k + channel] * passed[channel];
+    let mut passed = colour_gradient;
+    for channel in 0..3 {
+        if !(colour[channel] >= 0.0) {
+            passed[channel] = 0.0;
         }
+    }
+    let (used, rest) = sh_gradient.split_at_mut(3 * count);
+    rest.fill(0.0);
+    let mut basis_gradient = [0.0f32; 16];
+    let triples = used.as_chunks_mut::<3>().0.iter_mut().zip(coefficients.as_chunks::<3>().0);
+    for (k, (gradient, coefficient)) in triples.enumerate() {
+        *gradient = [basis[k] * passed[0], basis[k] * passed[1], basis[k] * passed[2]];
+        basis_gradient[k] =
+            coefficient[0] * passed[0] + coefficient[1] * passed[1] + coefficient[2] * passed[2];
     }
     if degree == 0 {
         return DVec3::ZERO;
@@ -71,6 +81,7 @@ const C3: [f32; 7] =
     [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_34, -0.457_045_8, 1.445_305_7, -0.590_043_6];
 
 /// Values of the real spherical harmonics, with the signs of the original 3D Gaussian Splatting.
+#[inline(always)]
 fn basis([x, y, z]: [f32; 3], degree: u32) -> [f32; 16] {
     let mut b = [0.0; 16];
     b[0] = C0;
@@ -100,6 +111,7 @@ fn basis([x, y, z]: [f32; 3], degree: u32) -> [f32; 16] {
 }
 
 /// `Σ_k g_k ∇ basis_k`.
+#[inline(always)]
 fn direction_gradient([x, y, z]: [f32; 3], degree: u32, g: &[f32; 16]) -> [f32; 3] {
     let (mut dx, mut dy, mut dz) = (-C1 * g[3], -C1 * g[1], C1 * g[2]);
     let (xx, yy, zz) = (x * x, y * y, z * z);

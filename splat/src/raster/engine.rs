@@ -1,6 +1,6 @@
 //! The stages strung together, and the [`Engine`] they make.
 
-use super::{footprint_moments, pass::Pass, session::CpuSession};
+use super::{footprint_moments, lanes::Instructions, pass::Pass, session::CpuSession};
 use crate::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
@@ -12,7 +12,36 @@ use crate::{
 
 /// The CPU engine; runs on the rayon pool that it is called from.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct CpuEngine;
+pub struct CpuEngine {
+    instructions: Instructions,
+}
+
+impl CpuEngine {
+    /// An engine whose kernels use `instructions`; the default detects them.
+    pub fn new(instructions: Instructions) -> Self {
+        Self { instructions }
+    }
+
+    /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
+    /// `H × W × 3`, `alpha_gradient` `H × W` or empty.
+    pub fn render_backward(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        image_gradient: &[f32],
+        alpha_gradient: &[f32],
+    ) -> GaussianGradients {
+        let mut pass = Pass::new(self.instructions);
+        let mut image = Image::filled(camera.width, camera.height, [0.0; 3]);
+        let degree = gaussians.sh_degree;
+        pass.forward(gaussians, camera, degree, background, &mut image, &mut []);
+        pass.blend_backward(background, image_gradient, alpha_gradient);
+        let mut gradients = GaussianGradients::zeros(gaussians);
+        pass.project_backward(gaussians, camera, degree, &[], &mut gradients);
+        gradients
+    }
+}
 
 impl Engine for CpuEngine {
     fn name(&self) -> &str {
@@ -25,7 +54,11 @@ impl Engine for CpuEngine {
         camera: &Camera,
         background: [f32; 3],
     ) -> Result<Rendering, EngineError> {
-        Ok(render(gaussians, camera, background))
+        let mut image = Image::filled(camera.width, camera.height, [0.0; 3]);
+        let mut alpha = vec![0.0; image.pixel_count()];
+        let mut pass = Pass::new(self.instructions);
+        pass.forward(gaussians, camera, gaussians.sh_degree, background, &mut image, &mut alpha);
+        Ok(Rendering { image, alpha })
     }
 
     fn footprint_moments(
@@ -34,36 +67,10 @@ impl Engine for CpuEngine {
         camera: &Camera,
         tracks: &TrackField,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
-        footprint_moments::footprint_moments(gaussians, camera, tracks)
+        footprint_moments::footprint_moments(self.instructions, gaussians, camera, tracks)
     }
 
     fn session(&self, input: SessionInput) -> Result<Box<dyn Session>, EngineError> {
-        Ok(Box::new(CpuSession::new(input)?))
+        Ok(Box::new(CpuSession::new(input, self.instructions)?))
     }
-}
-
-/// Renders one view, spherical harmonics at the set's own degree.
-pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Rendering {
-    let mut image = Image::filled(camera.width, camera.height, [0.0; 3]);
-    let mut alpha = vec![0.0; image.pixel_count()];
-    Pass::default().forward(gaussians, camera, gaussians.sh_degree, background, &mut image, &mut alpha);
-    Rendering { image, alpha }
-}
-
-/// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
-/// `H × W × 3`, `alpha_gradient` `H × W` or empty.
-pub fn render_backward(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    background: [f32; 3],
-    image_gradient: &[f32],
-    alpha_gradient: &[f32],
-) -> GaussianGradients {
-    let mut pass = Pass::default();
-    let mut image = Image::filled(camera.width, camera.height, [0.0; 3]);
-    pass.forward(gaussians, camera, gaussians.sh_degree, background, &mut image, &mut []);
-    pass.blend_backward(background, image_gradient, alpha_gradient, &[]);
-    let mut gradients = GaussianGradients::zeros(gaussians);
-    pass.project_backward(gaussians, camera, gaussians.sh_degree, &[], &mut gradients);
-    gradients
 }

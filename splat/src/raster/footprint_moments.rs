@@ -8,9 +8,10 @@ use rayon::prelude::*;
 
 use super::{
     ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
-    bin::Bins,
-    blend::{rows, span},
+    bin::{BAND_ROWS, Bins},
+    lanes::Instructions,
     project::{Footprint, project},
+    rows::{rows, span},
 };
 use crate::{
     cameras::Camera, engine::EngineError, gaussians::Gaussians, motion::moments::FootprintMoments,
@@ -107,6 +108,7 @@ impl RawMoments {
 
 /// Moments of every Gaussian's footprint, one entry per Gaussian; all zero for those that no pixel sees.
 pub(super) fn footprint_moments(
+    instructions: Instructions,
     gaussians: &Gaussians,
     camera: &Camera,
     tracks: &TrackField,
@@ -122,23 +124,24 @@ pub(super) fn footprint_moments(
         )));
     }
     let mut bins = Bins::default();
-    project(gaussians, camera, 0, bins.unsorted());
-    bins.sort(camera.height);
+    project(instructions, gaussians, camera, 0, &mut bins.projection);
+    bins.sort(camera.height, &mut Vec::new());
+    let footprints = &bins.projection.footprints;
     let shifts: Vec<[f64; 2]> =
-        bins.footprints.iter().map(|f| first_displacement(f, camera, tracks)).collect();
+        footprints.iter().map(|footprint| first_displacement(footprint, camera, tracks)).collect();
     let by_band: Vec<Vec<RawMoments>> = (0..bins.bands())
         .into_par_iter()
         .map(|band| band_moments(&bins, band, camera, tracks, &shifts))
         .collect();
-    let mut result = vec![FootprintMoments::default(); gaussians.len()];
-    for (position, footprint) in bins.footprints.iter().enumerate() {
+    let moments = footprints.iter().zip(shifts).enumerate().map(|(index, (footprint, shift))| {
+        let (first_band, places) = bins.places_of(index);
         let mut total = RawMoments::default();
-        for (band, &entry) in (footprint.first_band as usize..).zip(bins.entries_of(position)) {
-            total.add(&by_band[band][entry as usize - bins.starts[band]]);
+        for (band, &place) in by_band[first_band..].iter().zip(places) {
+            total.add(&band[place as usize]);
         }
-        result[footprint.index as usize] = total.centred(footprint.mean, shifts[position]);
-    }
-    Ok(result)
+        total.centred(footprint.mean, shift)
+    });
+    Ok(moments.collect())
 }
 
 /// Displacement of the pixel nearest to the projected mean: a reference point, not an estimate.
@@ -158,13 +161,13 @@ fn band_moments(
     shifts: &[[f64; 2]],
 ) -> Vec<RawMoments> {
     let width = camera.width as usize;
-    let first_row = band * super::bin::BAND_ROWS;
-    let row_count = super::bin::BAND_ROWS.min(camera.height as usize - first_row);
+    let first_row = band * BAND_ROWS;
+    let row_count = BAND_ROWS.min(camera.height as usize - first_row);
     let mut transmittance = vec![1.0f32; width * row_count];
     let mut moments = vec![RawMoments::default(); bins.band(band).len()];
-    for (sums, &position) in moments.iter_mut().zip(bins.band(band)) {
-        let footprint = &bins.footprints[position as usize];
-        let shift = shifts[position as usize];
+    for (sums, &index) in moments.iter_mut().zip(bins.band(band)) {
+        let footprint = &bins.projection.footprints[index as usize];
+        let shift = shifts[index as usize];
         for row in rows(footprint, first_row, row_count) {
             let Some(span) = span(footprint, row, width) else { continue };
             for x in span.first..span.end {

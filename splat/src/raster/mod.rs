@@ -1,4 +1,4 @@
-//! The CPU engine: differentiable rasterization of 3D Gaussians in rows of exact ellipse spans.
+//! The CPU engine: differentiable rasterization of 3D Gaussians in blocks of 4 × 4 pixels.
 //!
 //! One file per stage, each named as the stage: [`project`] → [`bin`] → [`blend`] → [`blend_backward`] →
 //! [`project_backward`]; [`footprint_moments`] shares the first three. The equations are those of 3D Gaussian
@@ -8,20 +8,24 @@
 //! taken in band order. So the result has the same bytes on one thread and on many.
 
 pub mod bin;
-pub mod blend;
+mod blend;
 pub mod blend_backward;
+mod blocks;
 mod colour;
+mod depth_order;
 mod engine;
 pub mod footprint_moments;
 mod lanes;
 mod pass;
 pub mod project;
 pub mod project_backward;
+mod rows;
 mod session;
 #[cfg(test)]
 mod tests;
 
-pub use engine::{CpuEngine, render, render_backward};
+pub use engine::CpuEngine;
+pub use lanes::{InstructionSet, Instructions, Unavailable};
 pub use pass::Pass;
 
 /// Points nearer than this to the principal plane are not drawn, in world units.

@@ -3,11 +3,12 @@
 use rayon::prelude::*;
 
 use super::{
-    bin::Bins,
+    bin::{BAND_ROWS, Bins},
     blend::{Band, blend},
-    blend_backward::{FootprintGradient, Replay, blend_backward},
-    project::project,
-    project_backward::{GeometryGradient, project_backward},
+    blend_backward::blend_backward,
+    lanes::Instructions,
+    project::{CHUNK, View, project},
+    project_backward::{GradientChunk, project_backward},
 };
 use crate::{
     cameras::Camera,
@@ -20,15 +21,18 @@ use crate::{
 /// Each method is a stage; all stages of a pass take the same Gaussians, camera and degree.
 #[derive(Clone, Debug, Default)]
 pub struct Pass {
+    instructions: Instructions,
     bins: Bins,
     bands: Vec<Band>,
-    replays: Vec<Replay>,
-    by_entry: Vec<FootprintGradient>,
-    by_footprint: Vec<FootprintGradient>,
-    computed: Vec<(GeometryGradient, [f32; 48])>,
+    by_projected_mean: Vec<[f32; 2]>,
 }
 
 impl Pass {
+    /// Empty buffers; kernels use `instructions`.
+    pub fn new(instructions: Instructions) -> Self {
+        Self { instructions, ..Self::default() }
+    }
+
     /// Stages 1 to 3: renders one view into `image` and, if it is not empty, `alpha`.
     pub fn forward(
         &mut self,
@@ -40,74 +44,64 @@ impl Pass {
         alpha: &mut [f32],
     ) {
         self.project(gaussians, camera, sh_degree);
-        self.bin(camera);
-        self.blend(camera, background, image, alpha);
+        self.bin(camera, &mut Vec::new());
+        self.blend(camera, background, &[], image, alpha);
     }
 
     /// Stage 1: footprints and colours.
     pub fn project(&mut self, gaussians: &Gaussians, camera: &Camera, sh_degree: u32) {
-        project(gaussians, camera, sh_degree, self.bins.unsorted());
+        project(self.instructions, gaussians, camera, sh_degree, &mut self.bins.projection);
     }
 
-    /// Stage 2: depth order, and the bands' lists.
-    pub fn bin(&mut self, camera: &Camera) {
-        self.bins.sort(camera.height);
+    /// Stage 2: depth order, and the bands' lists. `order` is what it was after an earlier step of the same view, or
+    /// empty; it saves time.
+    pub fn bin(&mut self, camera: &Camera, order: &mut Vec<u32>) {
+        self.bins.sort(camera.height, order);
     }
 
-    /// Stage 3: blends into `image` and, if it is not empty, `alpha`.
-    pub fn blend(&mut self, camera: &Camera, background: [f32; 3], image: &mut Image, alpha: &mut [f32]) {
-        let (width, height) = (camera.width as usize, camera.height as usize);
-        let bins = &self.bins;
-        self.bands.resize_with(bins.bands(), Band::default);
-        self.bands.par_iter_mut().enumerate().for_each(|(number, band)| {
-            band.reset(number, width, height);
-            blend(bins, number, band);
-        });
-        for band in &self.bands {
-            compose(band, background, &mut image.pixels, alpha);
-        }
-    }
-
-    /// Stage 4: the gradient of each footprint from that of the image, `H × W × 3`, and of alpha, `H × W` or empty.
-    /// Gaussians that are not `active` (empty: all are) get none.
-    pub fn blend_backward(
+    /// Stage 3: blends into `image` and, if it is not empty, `alpha`. A later gradient is taken by the `active` Gaussians
+    /// only (empty: all).
+    pub fn blend(
         &mut self,
+        camera: &Camera,
         background: [f32; 3],
-        image_gradient: &[f32],
-        alpha_gradient: &[f32],
         active: &[bool],
+        image: &mut Image,
+        alpha: &mut [f32],
     ) {
-        let bins = &self.bins;
-        self.replays.resize_with(bins.bands(), Replay::default);
-        self.by_entry.clear();
-        self.by_entry.resize(bins.entries.len(), FootprintGradient::default());
-        let mut rest = self.by_entry.as_mut_slice();
-        let mut work = Vec::with_capacity(bins.bands());
-        for (number, (band, replay)) in self.bands.iter().zip(&mut self.replays).enumerate() {
-            let (own, others) = rest.split_at_mut(bins.band(number).len());
-            rest = others;
-            work.push((number, band, replay, own));
-        }
-        work.into_par_iter().for_each(|(number, band, replay, gradients)| {
-            replay.reset(band, background, image_gradient, alpha_gradient);
-            blend_backward(bins, number, band, active, replay, gradients);
-        });
-        let by_entry = &self.by_entry;
-        (0..bins.footprints.len())
-            .into_par_iter()
-            .with_min_len(256)
-            .map(|position| {
-                let mut total = FootprintGradient::default();
-                for &entry in bins.entries_of(position) {
-                    total.add(&by_entry[entry as usize]);
-                }
-                total
-            })
-            .collect_into_vec(&mut self.by_footprint);
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let (bins, instructions) = (&self.bins, self.instructions);
+        self.bands.resize_with(bins.bands(), Band::default);
+        let band_pixels = BAND_ROWS * width;
+        let has_alpha = !alpha.is_empty();
+        let mut alphas = alpha.chunks_mut(band_pixels.max(1));
+        let alphas: Vec<&mut [f32]> = (0..bins.bands())
+            .map(|_| if has_alpha { alphas.next().unwrap_or_default() } else { &mut [] })
+            .collect();
+        self.bands
+            .par_iter_mut()
+            .zip(image.pixels.par_chunks_mut(3 * band_pixels.max(1)))
+            .zip(alphas)
+            .enumerate()
+            .for_each(|(number, ((band, pixels), alpha))| {
+                band.reset(instructions, bins, number, width, height, active);
+                blend(instructions, band, background, pixels, alpha);
+            });
     }
 
-    /// Stage 5: writes the gradient by the parameters of the active Gaussians that the view shows; others' stay as they
-    /// are.
+    /// Stage 4: sums over the pixels from the gradient by the image, `H × W × 3`, and by alpha, `H × W` or empty.
+    pub fn blend_backward(&mut self, background: [f32; 3], image_gradient: &[f32], alpha_gradient: &[f32]) {
+        let instructions = self.instructions;
+        self.bands.par_iter_mut().for_each(|band| {
+            let pixels = band.first_row * band.width..(band.first_row + band.rows) * band.width;
+            let gradient = &image_gradient[3 * pixels.start..3 * pixels.end];
+            let alpha_gradient = alpha_gradient.get(pixels).unwrap_or_default();
+            blend_backward(instructions, band, background, gradient, alpha_gradient);
+        });
+    }
+
+    /// Stage 5: writes the gradient by every parameter; zero for Gaussians that the view does not show or that are not
+    /// active.
     pub fn project_backward(
         &mut self,
         gaussians: &Gaussians,
@@ -116,66 +110,29 @@ impl Pass {
         active: &[bool],
         gradients: &mut GaussianGradients,
     ) {
-        let centre = camera.centre();
+        let (bins, bands, instructions) = (&self.bins, &self.bands, self.instructions);
+        let view = View { camera, centre: camera.centre(), sh_degree };
         let stride = gaussians.sh_coefficients() * 3;
-        let is_active = |index: usize| active.get(index).copied().unwrap_or(true);
-        let bins = &self.bins;
-        bins.footprints
-            .par_iter()
-            .zip(&self.by_footprint)
-            .with_min_len(256)
-            .map(|(footprint, gradient)| {
-                let mut sh = [0.0f32; 48];
-                if !is_active(footprint.index as usize) {
-                    return (GeometryGradient::default(), sh);
-                }
-                let geometry = project_backward(
-                    gaussians,
-                    footprint,
-                    camera,
-                    centre,
-                    sh_degree,
-                    gradient,
-                    &mut sh[..stride],
-                );
-                if !(geometry.is_finite() && sh.iter().all(|value| value.is_finite())) {
-                    // Beyond single precision there is no direction to follow; a step of infinity would spread.
-                    return (GeometryGradient::default(), [0.0; 48]);
-                }
-                (geometry, sh)
-            })
-            .collect_into_vec(&mut self.computed);
-        for (footprint, (geometry, sh)) in bins.footprints.iter().zip(&self.computed) {
-            let index = footprint.index as usize;
-            gradients.means[index] = geometry.mean;
-            gradients.rotations[index] = geometry.rotation;
-            gradients.log_scales[index] = geometry.log_scale;
-            gradients.logit_opacities[index] = geometry.logit_opacity;
-            gradients.sh[index * stride..(index + 1) * stride].copy_from_slice(&sh[..stride]);
-        }
+        self.by_projected_mean.resize(gaussians.len(), [0.0; 2]);
+        let arrays = (
+            gradients.means.par_chunks_mut(CHUNK),
+            gradients.rotations.par_chunks_mut(CHUNK),
+            gradients.log_scales.par_chunks_mut(CHUNK),
+            gradients.logit_opacities.par_chunks_mut(CHUNK),
+            gradients.sh.par_chunks_mut(CHUNK * stride),
+            self.by_projected_mean.par_chunks_mut(CHUNK),
+        );
+        arrays.into_par_iter().enumerate().for_each(|(chunk, arrays)| {
+            let (means, rotations, log_scales, logit_opacities, sh, projected_means) = arrays;
+            let gradients =
+                GradientChunk { means, rotations, log_scales, logit_opacities, sh, projected_means };
+            project_backward(instructions, gaussians, bins, bands, &view, active, chunk * CHUNK, gradients);
+        });
     }
 
     /// The Gaussians that the view shows, each with the gradient by its projected mean, per pixel, after stage 5.
     pub fn visible(&self) -> impl Iterator<Item = (usize, [f32; 2])> {
-        let footprints = self.bins.footprints.iter();
-        footprints
-            .zip(&self.computed)
-            .map(|(footprint, (geometry, _))| (footprint.index as usize, geometry.projected_mean))
-    }
-}
-
-fn compose(band: &Band, background: [f32; 3], pixels: &mut [f32], alpha: &mut [f32]) {
-    for row in 0..band.rows {
-        for x in 0..band.width {
-            let (place, pixel) = (row * band.stride + x, (band.first_row + row) * band.width + x);
-            let transmittance = band.transmittance[place].abs();
-            for channel in 0..3 {
-                pixels[3 * pixel + channel] =
-                    band.colour[channel][place] + transmittance * background[channel];
-            }
-            if let Some(value) = alpha.get_mut(pixel) {
-                *value = 1.0 - transmittance;
-            }
-        }
+        let all = self.by_projected_mean.iter().copied().enumerate();
+        all.filter(|&(index, _)| self.bins.projection.is_visible(index))
     }
 }

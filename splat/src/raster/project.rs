@@ -6,29 +6,59 @@
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::{ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, NEAR_PLANE, bin::BAND_ROWS, colour};
+use super::{
+    ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, NEAR_PLANE,
+    bin::BAND_ROWS,
+    colour,
+    lanes::{Instructions, Simd, simd_kernel},
+};
 use crate::{cameras::Camera, gaussians::Gaussians};
 
 /// Gaussians per parallel task.
-const CHUNK: usize = 512;
+pub(super) const CHUNK: usize = 512;
 
-/// A Gaussian that reaches at least one pixel.
+/// All Gaussians in one view, in their order.
+#[derive(Clone, Debug, Default)]
+pub struct Projection {
+    /// Meaningless for those that reach no pixel.
+    pub footprints: Vec<Footprint>,
+    /// Camera z, world units; NaN for those that reach no pixel.
+    pub depths: Vec<f64>,
+    /// Bands of rows that they touch; none for those that reach no pixel.
+    pub bands: Vec<BandRange>,
+}
+
+impl Projection {
+    /// Whether a Gaussian reaches a pixel.
+    pub fn is_visible(&self, index: usize) -> bool {
+        !self.depths[index].is_nan()
+    }
+}
+
+/// Consecutive bands.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct BandRange {
+    /// The first.
+    pub first: u32,
+    /// One past the last.
+    pub end: u32,
+}
+
+/// One Gaussian in one view.
 ///
 /// The exponent at pixel offset `(ex, ey)` from the mean is written row by row,
 /// `½ (ex - slope · ey)² · inverse_conditional + ½ ey² · inverse_yy`, which has no cancellation however thin and
 /// slanted the footprint is: `slope = cov_xy / cov_yy` is the regression line through the row centres and
 /// `1 / inverse_conditional = cov_xx - cov_xy² / cov_yy` the variance along a row.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Footprint {
-    /// Which Gaussian.
-    pub index: u32,
-    /// Camera z, world units.
-    pub depth: f64,
     /// Projected mean, pixels.
     pub mean: [f64; 2],
     /// Row centre shift per row, `cov_xy / cov_yy`.
     pub slope: f64,
-    /// Inverse of the variance along a row, 1 / pixels².
+    /// Variance along a row, pixels².
+    pub conditional: f64,
+    /// Its inverse, 1 / pixels².
     pub inverse_conditional: f64,
     /// Inverse of the variance across rows, 1 / pixels².
     pub inverse_yy: f64,
@@ -38,12 +68,12 @@ pub struct Footprint {
     pub log_opacity: f64,
     /// Exponent at which alpha falls to [`ALPHA_MIN`], `ln(opacity / ALPHA_MIN)`.
     pub reach: f64,
+    /// Rows between the mean and the end of the reach, pixels.
+    pub half_height: f64,
+    /// Rows between the mean and the rightmost point in reach, pixels.
+    pub row_of_rightmost: f64,
     /// Colour seen from the camera, not below 0.
     pub colour: [f32; 3],
-    /// First band that the footprint touches.
-    pub first_band: u32,
-    /// One past the last band that the footprint touches.
-    pub end_band: u32,
 }
 
 /// The local affine projection of one Gaussian, shared by this stage and its gradient.
@@ -63,6 +93,7 @@ pub(super) struct LocalProjection {
 }
 
 /// `None` behind the near plane.
+#[inline(always)]
 pub(super) fn local_projection(
     gaussians: &Gaussians,
     index: usize,
@@ -96,6 +127,7 @@ pub(super) fn local_projection(
     })
 }
 
+#[inline(always)]
 fn clamp_slope(slope: f64, focal: f64, principal: f64, size: f64) -> (f64, bool) {
     let margin = FRUSTUM_MARGIN * 0.5 * size / focal;
     let low = -(principal / focal + margin);
@@ -109,31 +141,74 @@ fn clamp_slope(slope: f64, focal: f64, principal: f64, size: f64) -> (f64, bool)
     (slope, false)
 }
 
-/// Footprints of the Gaussians that reach a pixel of `camera`, in index order, with spherical harmonics evaluated up to
-/// `sh_degree`. Gaussians whose parameters are not finite reach none.
-pub fn project(gaussians: &Gaussians, camera: &Camera, sh_degree: u32, footprints: &mut Vec<Footprint>) {
-    let centre = camera.centre();
-    let chunks: Vec<Vec<Footprint>> = (0..gaussians.len())
-        .collect::<Vec<_>>()
-        .par_chunks(CHUNK)
-        .map(|indices| {
-            indices
-                .iter()
-                .filter_map(|&index| footprint(gaussians, index, camera, centre, sh_degree))
-                .collect()
-        })
-        .collect();
-    footprints.clear();
-    footprints.extend(chunks.into_iter().flatten());
+/// Projects every Gaussian; spherical harmonics up to `sh_degree`.
+pub fn project(
+    instructions: Instructions,
+    gaussians: &Gaussians,
+    camera: &Camera,
+    sh_degree: u32,
+    projection: &mut Projection,
+) {
+    let count = gaussians.len();
+    projection.footprints.resize(count, Footprint::default());
+    projection.depths.resize(count, f64::NAN);
+    projection.bands.resize(count, BandRange::default());
+    let view = View { camera, centre: camera.centre(), sh_degree };
+    let arrays = (
+        projection.footprints.par_chunks_mut(CHUNK),
+        projection.depths.par_chunks_mut(CHUNK),
+        projection.bands.par_chunks_mut(CHUNK),
+    );
+    arrays.into_par_iter().enumerate().for_each(|(chunk, (footprints, depths, bands))| {
+        project_chunk(instructions, gaussians, &view, chunk * CHUNK, footprints, depths, bands);
+    });
 }
 
-fn footprint(
+/// A view as the stages of a Gaussian need it.
+pub(super) struct View<'a> {
+    pub camera: &'a Camera,
+    /// Of the camera, world units.
+    pub centre: DVec3,
+    pub sh_degree: u32,
+}
+
+simd_kernel! {
+    /// The Gaussians from `first` on.
+    fn project_chunk(
+        gaussians: &Gaussians,
+        view: &View<'_>,
+        first: usize,
+        footprints: &mut [Footprint],
+        depths: &mut [f64],
+        bands: &mut [BandRange],
+    ) = project_kernel
+}
+
+/// Plain double precision that gains from three-operand instructions.
+#[inline(always)]
+fn project_kernel<S: Simd>(
     gaussians: &Gaussians,
-    index: usize,
-    camera: &Camera,
-    centre: DVec3,
-    sh_degree: u32,
-) -> Option<Footprint> {
+    view: &View<'_>,
+    first: usize,
+    footprints: &mut [Footprint],
+    depths: &mut [f64],
+    bands: &mut [BandRange],
+) {
+    for (place, slot) in footprints.iter_mut().enumerate() {
+        let projected = footprint(gaussians, first + place, view);
+        (depths[place], bands[place]) = match projected {
+            Some((footprint, depth, band_range)) => {
+                *slot = footprint;
+                (depth, band_range)
+            }
+            None => (f64::NAN, BandRange::default()),
+        };
+    }
+}
+
+#[inline(always)]
+fn footprint(gaussians: &Gaussians, index: usize, view: &View<'_>) -> Option<(Footprint, f64, BandRange)> {
+    let camera = view.camera;
     let opacity = gaussians.opacity(index);
     let log_opacity = opacity.ln();
     let reach = log_opacity - f64::from(ALPHA_MIN).ln();
@@ -165,24 +240,29 @@ fn footprint(
     }
     let first_row = (mean[1] - half_height - 0.5).max(0.0) as usize;
     let last_row = (mean[1] + half_height - 0.5).min(height - 1.0) as usize;
-    let colour = colour::seen_from(gaussians, index, centre, sh_degree);
-    colour.iter().all(|channel| channel.is_finite()).then_some(Footprint {
-        index: index as u32,
-        depth: local.camera.z,
+    let colour = colour::seen_from(gaussians, index, view.centre, view.sh_degree);
+    if !colour.iter().all(|channel| channel.is_finite()) {
+        return None;
+    }
+    let bands = BandRange { first: (first_row / BAND_ROWS) as u32, end: (last_row / BAND_ROWS + 1) as u32 };
+    let footprint = Footprint {
         mean,
         slope,
+        conditional,
         inverse_conditional: 1.0 / conditional,
         inverse_yy: 1.0 / yy,
         opacity,
         log_opacity,
         reach,
+        half_height,
+        row_of_rightmost: half_width * xy / xx,
         colour,
-        first_band: (first_row / BAND_ROWS) as u32,
-        end_band: (last_row / BAND_ROWS + 1) as u32,
-    })
+    };
+    Some((footprint, local.camera.z, bands))
 }
 
 /// `cov_xx - cov_xy² / cov_yy` as a sum of non-negative terms (Lagrange's identity), exact for needles.
+#[inline(always)]
 pub(super) fn conditional_variance(across: DVec3, along: DVec3, yy: f64) -> f64 {
     let unblurred = across.cross(along).length_squared() + LOW_PASS * across.length_squared();
     LOW_PASS + unblurred / yy

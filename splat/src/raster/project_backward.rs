@@ -3,75 +3,178 @@
 use glam::{DMat3, DVec3};
 
 use super::{
+    bin::Bins,
+    blend::Band,
     blend_backward::FootprintGradient,
     colour,
-    project::{Footprint, LocalProjection, local_projection},
+    lanes::{Simd, prefetch, simd_kernel},
+    project::{Footprint, LocalProjection, View, local_projection},
 };
 use crate::{cameras::Camera, gaussians::Gaussians};
 
+/// Gaussians whose sums are asked for ahead.
+const AHEAD: usize = 4;
+
+/// Gradients of consecutive Gaussians by their parameters, of the shapes of `GaussianGradients`.
+pub(super) struct GradientChunk<'a> {
+    pub means: &'a mut [[f32; 3]],
+    pub rotations: &'a mut [[f32; 4]],
+    pub log_scales: &'a mut [[f32; 3]],
+    pub logit_opacities: &'a mut [f32],
+    pub sh: &'a mut [f32],
+    /// By the projected mean, per pixel.
+    pub projected_means: &'a mut [[f32; 2]],
+}
+
+impl GradientChunk<'_> {
+    #[inline(always)]
+    fn set(&mut self, place: usize, geometry: &GeometryGradient) {
+        self.means[place] = geometry.mean;
+        self.rotations[place] = geometry.rotation;
+        self.log_scales[place] = geometry.log_scale;
+        self.logit_opacities[place] = geometry.logit_opacity;
+        self.projected_means[place] = geometry.projected_mean;
+    }
+}
+
+simd_kernel! {
+    /// Writes the gradients of the Gaussians from `first` on; zero for those that the view does not show or that are not
+    /// `active` (empty: all are).
+    pub(super) fn project_backward(
+        gaussians: &Gaussians,
+        bins: &Bins,
+        bands: &[Band],
+        view: &View<'_>,
+        active: &[bool],
+        first: usize,
+        gradients: GradientChunk<'_>,
+    ) = project_backward_kernel
+}
+
+#[inline(always)]
+fn project_backward_kernel<S: Simd>(
+    gaussians: &Gaussians,
+    bins: &Bins,
+    bands: &[Band],
+    view: &View<'_>,
+    active: &[bool],
+    first: usize,
+    mut gradients: GradientChunk<'_>,
+) {
+    let stride = gaussians.sh_coefficients() * 3;
+    let count = gradients.means.len();
+    for place in 0..count {
+        let index = first + place;
+        prefetch_sums(bins, bands, first + (place + AHEAD).min(count - 1));
+        let footprint = &bins.projection.footprints[index];
+        let is_wanted = bins.projection.is_visible(index) && active.get(index).copied().unwrap_or(true);
+        let mut geometry = GeometryGradient::default();
+        if is_wanted {
+            let gradient = sum_over_bands(bins, bands, index);
+            let sh = &mut gradients.sh[place * stride..(place + 1) * stride];
+            geometry = gradient_of(gaussians, index, footprint, view, &gradient, sh);
+        }
+        // Beyond single precision there is no direction to follow; a step of infinity would spread.
+        if !(is_wanted && geometry.is_finite()) {
+            geometry = GeometryGradient::default();
+            gradients.sh[place * stride..(place + 1) * stride].fill(0.0);
+        }
+        gradients.set(place, &geometry);
+    }
+}
+
+/// Bands keep their sums in depth order, which is no order in memory.
+#[inline(always)]
+fn prefetch_sums(bins: &Bins, bands: &[Band], index: usize) {
+    let (first_band, places) = bins.places_of(index);
+    for (band, &place) in bands[first_band..].iter().zip(places) {
+        prefetch(&band.sums[place as usize]);
+    }
+}
+
+#[inline(always)]
+fn sum_over_bands(bins: &Bins, bands: &[Band], index: usize) -> FootprintGradient {
+    let mut gradient = FootprintGradient::default();
+    let (first_band, places) = bins.places_of(index);
+    for (band, &place) in bands[first_band..].iter().zip(places) {
+        gradient.add(&band.sums[place as usize]);
+    }
+    gradient
+}
+
 /// Gradient of the loss by the geometry of one Gaussian.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct GeometryGradient {
+struct GeometryGradient {
     /// By the world mean.
-    pub mean: [f32; 3],
+    mean: [f32; 3],
     /// By the stored quaternion `w, x, y, z`.
-    pub rotation: [f32; 4],
+    rotation: [f32; 4],
     /// By the logarithm of the scales.
-    pub log_scale: [f32; 3],
+    log_scale: [f32; 3],
     /// By the logit of the opacity.
-    pub logit_opacity: f32,
+    logit_opacity: f32,
     /// By the projected mean, per pixel.
-    pub projected_mean: [f32; 2],
+    projected_mean: [f32; 2],
+    /// By the colour; every spherical-harmonic gradient is a share of it.
+    colour: [f32; 3],
 }
 
 impl GeometryGradient {
-    pub(super) fn is_finite(&self) -> bool {
+    #[inline(always)]
+    fn is_finite(&self) -> bool {
         let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
         finite(&self.mean)
             && finite(&self.rotation)
             && finite(&self.log_scale)
             && self.logit_opacity.is_finite()
             && finite(&self.projected_mean)
+            && finite(&self.colour)
     }
 }
 
-/// Turns the gradient of a footprint into that of its Gaussian; adds the colour's share to `sh_gradient` (`K × 3`).
-pub fn project_backward(
+/// Turns the gradient of a footprint into that of its Gaussian, number `index`; writes the colour's share to
+/// `sh_gradient` (`K × 3`).
+#[inline(always)]
+fn gradient_of(
     gaussians: &Gaussians,
+    index: usize,
     footprint: &Footprint,
-    camera: &Camera,
-    centre: DVec3,
-    sh_degree: u32,
+    view: &View<'_>,
     gradient: &FootprintGradient,
     sh_gradient: &mut [f32],
 ) -> GeometryGradient {
-    let index = footprint.index as usize;
+    let camera = view.camera;
     let Some(local) = local_projection(gaussians, index, camera) else {
+        sh_gradient.fill(0.0);
         return GeometryGradient::default();
     };
     let projected_mean = mean_gradient(footprint, gradient);
     let spread = spread_gradient(footprint, gradient, &local);
     let rows = [local.axes * spread[0], local.axes * spread[1]];
     let in_camera = camera_gradient(camera, &local, projected_mean, rows);
-    let colour_gradient = gradient.colour.map(|value| value as f32);
-    let from_colour = colour::backward(gaussians, index, centre, sh_degree, colour_gradient, sh_gradient);
+    let [red, green, blue] = gradient.colour;
+    let colour = [red as f32, green as f32, blue as f32];
+    let from_colour = colour::backward(gaussians, index, view.centre, view.sh_degree, colour, sh_gradient);
     let mean = camera.rotation.transpose() * in_camera + from_colour;
     let axes = outer(local.rows[0], spread[0]) + outer(local.rows[1], spread[1]);
-    let (log_scale, rotation) = axes_gradient(gaussians, index, &local, axes);
+    let (log_scale, [w, x, y, z]) = axes_gradient(gaussians, index, &local, axes);
     GeometryGradient {
         mean: mean.as_vec3().to_array(),
-        rotation: rotation.map(|value| value as f32),
+        rotation: [w as f32, x as f32, y as f32, z as f32],
         log_scale: log_scale.as_vec3().to_array(),
         logit_opacity: (gradient.v * (1.0 - footprint.opacity)) as f32,
-        projected_mean: projected_mean.map(|value| value as f32),
+        projected_mean: [projected_mean[0] as f32, projected_mean[1] as f32],
+        colour,
     }
 }
 
+#[inline(always)]
 fn outer(column: DVec3, row: DVec3) -> DMat3 {
     DMat3::from_cols(column * row.x, column * row.y, column * row.z)
 }
 
 /// By the projected mean: alpha's exponent falls with `d` along the row and with `dy` across.
+#[inline(always)]
 fn mean_gradient(footprint: &Footprint, gradient: &FootprintGradient) -> [f64; 2] {
     let x = footprint.inverse_conditional * gradient.v_d;
     let y = -footprint.slope * x + footprint.inverse_yy * gradient.v_y;
@@ -79,6 +182,7 @@ fn mean_gradient(footprint: &Footprint, gradient: &FootprintGradient) -> [f64; 2
 }
 
 /// By the two rows of `J W R diag(exp(s))`, through `inverse_conditional`, `slope` and `inverse_yy`.
+#[inline(always)]
 fn spread_gradient(
     footprint: &Footprint,
     gradient: &FootprintGradient,
@@ -97,6 +201,7 @@ fn spread_gradient(
 }
 
 /// By the mean in camera axes, through the projected mean and through the Jacobian's entries.
+#[inline(always)]
 fn camera_gradient(camera: &Camera, local: &LocalProjection, mean: [f64; 2], rows: [DVec3; 2]) -> DVec3 {
     let inverse_z = 1.0 / local.camera.z;
     let jacobian = [camera.rotation * rows[0], camera.rotation * rows[1]];
@@ -120,6 +225,7 @@ fn camera_gradient(camera: &Camera, local: &LocalProjection, mean: [f64; 2], row
 }
 
 /// By log scales and quaternion, from the gradient by `R diag(exp(s))`.
+#[inline(always)]
 fn axes_gradient(
     gaussians: &Gaussians,
     index: usize,
@@ -137,6 +243,7 @@ fn axes_gradient(
     (log_scale, quaternion_gradient(gaussians, index, by_rotation))
 }
 
+#[inline(always)]
 fn quaternion_gradient(gaussians: &Gaussians, index: usize, g: DMat3) -> [f64; 4] {
     let q = gaussians.rotation(index);
     let (w, x, y, z) = (q.w, q.x, q.y, q.z);

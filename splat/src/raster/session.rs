@@ -1,6 +1,6 @@
 //! An optimisation session of the CPU engine: parameters, optimiser state, images and buffers live as long as it does.
 
-use super::pass::Pass;
+use super::{lanes::Instructions, pass::Pass};
 use crate::{
     cameras::Camera,
     engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
@@ -12,6 +12,8 @@ use crate::{
 
 struct SessionView {
     camera: Camera,
+    /// Depth order of the last step on this view.
+    order: Vec<u32>,
     loss: PhotometricLoss,
 }
 
@@ -32,7 +34,7 @@ pub(super) struct CpuSession {
 }
 
 impl CpuSession {
-    pub(super) fn new(input: SessionInput) -> Result<Self, EngineError> {
+    pub(super) fn new(input: SessionInput, instructions: Instructions) -> Result<Self, EngineError> {
         check(&input)?;
         let count = input.gaussians.len();
         let views = input
@@ -40,6 +42,7 @@ impl CpuSession {
             .iter()
             .map(|view| SessionView {
                 camera: view.camera.clone(),
+                order: Vec::new(),
                 loss: PhotometricLoss::new(&view.image, view.mask.as_deref(), input.dssim_weight),
             })
             .collect();
@@ -51,7 +54,7 @@ impl CpuSession {
             gaussians: input.gaussians,
             views,
             background: input.background,
-            pass: Pass::default(),
+            pass: Pass::new(instructions),
             rendered: Image::filled(0, 0, [0.0; 3]),
             image_gradient: Vec::new(),
             workspace: LossWorkspace::default(),
@@ -74,18 +77,12 @@ impl Session for CpuSession {
             return Err(EngineError::InvalidInput(format!("view {view} of {}", self.views.len())));
         }
         self.prepare(view);
-        let SessionView { camera, loss } = &self.views[view];
-        self.pass.forward(
-            &self.gaussians,
-            camera,
-            rates.sh_degree,
-            self.background,
-            &mut self.rendered,
-            &mut [],
-        );
+        let SessionView { camera, order, loss } = &mut self.views[view];
+        self.pass.project(&self.gaussians, camera, rates.sh_degree);
+        self.pass.bin(camera, order);
+        self.pass.blend(camera, self.background, &self.active, &mut self.rendered, &mut []);
         let value = loss.evaluate(&self.rendered, &mut self.workspace, &mut self.image_gradient);
-        self.pass.blend_backward(self.background, &self.image_gradient, &[], &self.active);
-        self.gradients.clear();
+        self.pass.blend_backward(self.background, &self.image_gradient, &[]);
         self.pass.project_backward(
             &self.gaussians,
             camera,

@@ -3,13 +3,13 @@
 
 use std::sync::Arc;
 
-use super::{CpuEngine, render, render_backward};
+use super::CpuEngine;
 use crate::{
     engine::{Engine, EngineError, SessionInput, TrainingView},
     gaussians::Gaussians,
     image::Image,
     optim::LearningRates,
-    testing::{arc, blobs, on_threads},
+    testing::{arc, blobs, on_threads, render},
 };
 
 const BLACK: [f32; 3] = [0.0; 3];
@@ -37,7 +37,7 @@ fn input(gaussians: Gaussians, truth: &Gaussians) -> SessionInput {
 }
 
 fn optimised(input: SessionInput, steps: usize) -> (Gaussians, Vec<f32>) {
-    let mut session = CpuEngine.session(input).unwrap();
+    let mut session = CpuEngine::default().session(input).unwrap();
     let losses = (0..steps).map(|step| session.step(step % 3, &RATES).unwrap().loss).collect();
     (session.gaussians().unwrap(), losses)
 }
@@ -77,7 +77,7 @@ fn frozen_gaussians_stay_and_the_others_move() {
 #[test]
 fn replaced_gaussians_are_optimised_from_where_they_are_put() {
     let truth = blobs(30, 6);
-    let mut session = CpuEngine.session(input(blobs(30, 7), &truth)).unwrap();
+    let mut session = CpuEngine::default().session(input(blobs(30, 7), &truth)).unwrap();
     session.step(0, &RATES).unwrap();
     session.replace(truth.clone(), &vec![None; 30]).unwrap();
     assert_eq!(session.gaussians().unwrap(), truth);
@@ -92,7 +92,7 @@ fn a_session_refuses_what_does_not_fit() {
     let refused = |change: &dyn Fn(&mut SessionInput)| {
         let mut input = input(truth.clone(), &truth);
         change(&mut input);
-        matches!(CpuEngine.session(input).err(), Some(EngineError::InvalidInput(_)))
+        matches!(CpuEngine::default().session(input).err(), Some(EngineError::InvalidInput(_)))
     };
     assert!(refused(&|input| input.views.clear()), "no view");
     assert!(refused(&|input| input.frozen = vec![true]), "flags for other Gaussians");
@@ -101,7 +101,7 @@ fn a_session_refuses_what_does_not_fit() {
     assert!(refused(&|input| {
         input.gaussians.sh.pop();
     }));
-    let mut session = CpuEngine.session(input(truth.clone(), &truth)).unwrap();
+    let mut session = CpuEngine::default().session(input(truth.clone(), &truth)).unwrap();
     assert!(session.step(3, &RATES).is_err(), "no such view");
     assert!(session.replace(truth, &[]).is_err(), "sources of other Gaussians");
 }
@@ -149,7 +149,7 @@ fn extreme_parameters_give_finite_images_and_gradients() {
         let rendering = render(&gaussians, camera, BLACK);
         assert!(rendering.image.pixels.iter().all(|value| value.is_finite()), "image {number}");
         let seed = vec![1.0; rendering.image.pixels.len()];
-        let gradients = render_backward(&gaussians, camera, BLACK, &seed, &[]);
+        let gradients = CpuEngine::default().render_backward(&gaussians, camera, BLACK, &seed, &[]);
         let all = gradients.means.as_flattened().iter().chain(gradients.rotations.as_flattened());
         let all = all.chain(gradients.log_scales.as_flattened()).chain(&gradients.logit_opacities);
         assert!(all.chain(&gradients.sh).all(|value| value.is_finite()), "gradient {number}");

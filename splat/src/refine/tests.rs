@@ -4,8 +4,8 @@ use std::{ops::ControlFlow, sync::Arc};
 
 use super::*;
 use crate::{
-    raster::{CpuEngine, render},
-    testing::{arc, blobs},
+    raster::CpuEngine,
+    testing::{arc, blobs, render},
 };
 
 const BLACK: [f32; 3] = [0.0; 3];
@@ -39,8 +39,9 @@ fn a_displaced_set_comes_closer_to_the_images() {
     let truth = blobs(60, 1);
     let keep_going = &mut |_, _| ControlFlow::Continue(());
     let settings = RefineSettings { plateau_window: 0, ..settings(120) };
-    let refined =
-        refine(&CpuEngine, input(displaced(&truth), &truth), &settings, keep_going).unwrap().unwrap();
+    let refined = refine(&CpuEngine::default(), input(displaced(&truth), &truth), &settings, keep_going)
+        .unwrap()
+        .unwrap();
     assert_eq!(refined.steps, 120);
     assert_eq!(refined.gaussians.len(), truth.len());
     assert!(refined.loss[1] < 0.5 * refined.loss[0], "{:?}", refined.loss);
@@ -52,8 +53,9 @@ fn a_flat_loss_ends_it_early() {
     let keep_going = &mut |_, _| ControlFlow::Continue(());
     let settings =
         RefineSettings { mean_rate: 0.0, plateau_window: 9, plateau_improvement: 0.9, ..settings(500) };
-    let refined =
-        refine(&CpuEngine, input(displaced(&truth), &truth), &settings, keep_going).unwrap().unwrap();
+    let refined = refine(&CpuEngine::default(), input(displaced(&truth), &truth), &settings, keep_going)
+        .unwrap()
+        .unwrap();
     assert!(refined.steps < 500, "{} steps", refined.steps);
 }
 
@@ -61,8 +63,9 @@ fn a_flat_loss_ends_it_early() {
 fn no_iterations_change_nothing() {
     let truth = blobs(10, 3);
     let keep_going = &mut |_, _| ControlFlow::Continue(());
-    let refined =
-        refine(&CpuEngine, input(truth.clone(), &truth), &settings(0), keep_going).unwrap().unwrap();
+    let refined = refine(&CpuEngine::default(), input(truth.clone(), &truth), &settings(0), keep_going)
+        .unwrap()
+        .unwrap();
     assert_eq!((refined.gaussians, refined.steps), (truth, 0));
 }
 
@@ -71,5 +74,9 @@ fn it_stops_when_asked() {
     let truth = blobs(10, 4);
     let stop_at_five =
         &mut |done, _| if done == 5 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
-    assert!(refine(&CpuEngine, input(truth.clone(), &truth), &settings(50), stop_at_five).unwrap().is_none());
+    assert!(
+        refine(&CpuEngine::default(), input(truth.clone(), &truth), &settings(50), stop_at_five)
+            .unwrap()
+            .is_none()
+    );
 }

@@ -9,8 +9,8 @@ use crate::{
     engine::DensityStatistics,
     gaussians::{logit, sh},
     metrics,
-    raster::{CpuEngine, render},
-    testing::{arc, blobs},
+    raster::CpuEngine,
+    testing::{arc, blobs, render},
 };
 
 const BLACK: [f32; 3] = [0.0; 3];
@@ -67,7 +67,7 @@ fn gain(with_points: bool) -> f64 {
             input.settings.densify_until = 0.0;
             input.settings.plateau_window = 0;
         }
-        let model = reconstruct(&CpuEngine, &input, &mut go_on).unwrap();
+        let model = reconstruct(&CpuEngine::default(), &input, &mut go_on).unwrap();
         assert!(model.len() <= input.settings.max_gaussians);
         training_psnr(&model, &input)
     };
@@ -89,15 +89,18 @@ fn without_points_it_starts_from_random_ones_in_view_of_the_cameras() {
 #[test]
 fn the_same_seed_gives_the_same_model() {
     let (input, _) = input(90, true);
-    let first = reconstruct(&CpuEngine, &input, &mut go_on).unwrap();
-    assert_eq!(first, reconstruct(&CpuEngine, &input, &mut go_on).unwrap());
+    let first = reconstruct(&CpuEngine::default(), &input, &mut go_on).unwrap();
+    assert_eq!(first, reconstruct(&CpuEngine::default(), &input, &mut go_on).unwrap());
 }
 
 #[test]
 fn it_refuses_one_view_and_cameras_that_share_nothing() {
     let (mut one_view, _) = input(10, true);
     one_view.views.truncate(1);
-    assert!(matches!(reconstruct(&CpuEngine, &one_view, &mut go_on), Err(StaticModelError::BadInput(_))));
+    assert!(matches!(
+        reconstruct(&CpuEngine::default(), &one_view, &mut go_on),
+        Err(StaticModelError::BadInput(_))
+    ));
     let (mut apart, _) = input(10, false);
     apart.views.truncate(2);
     // Back to back.
@@ -105,7 +108,10 @@ fn it_refuses_one_view_and_cameras_that_share_nothing() {
         glam::DMat3::from_rotation_y(std::f64::consts::PI) * apart.views[0].camera.rotation;
     apart.views[1].camera.translation = DVec3::new(0.0, 0.0, -40.0);
     apart.views[0].camera.translation = DVec3::new(0.0, 0.0, -40.0);
-    assert!(matches!(reconstruct(&CpuEngine, &apart, &mut go_on), Err(StaticModelError::BadInput(_))));
+    assert!(matches!(
+        reconstruct(&CpuEngine::default(), &apart, &mut go_on),
+        Err(StaticModelError::BadInput(_))
+    ));
 }
 
 #[test]
@@ -114,7 +120,10 @@ fn it_stops_when_asked() {
     let mut stop = |progress: StaticModelProgress| {
         if progress.step == 7 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
-    assert!(matches!(reconstruct(&CpuEngine, &input, &mut stop), Err(StaticModelError::Cancelled)));
+    assert!(matches!(
+        reconstruct(&CpuEngine::default(), &input, &mut stop),
+        Err(StaticModelError::Cancelled)
+    ));
 }
 
 #[test]

@@ -1,0 +1,138 @@
+//! Sixteen pixels at a time, and the choice of instruction set at run time.
+//!
+//! Kernels are written once, generic over [`Simd`]. [`simd_kernel!`] compiles such a kernel for AVX-512, for AVX2 + FMA
+//! and for plain arrays, which the compiler turns into the baseline's instructions (SSE2, NEON). AVX-512 and AVX2 give
+//! the same bytes; the baseline of x86 rounds after every multiplication where they round once after a fused
+//! multiplication and addition.
+
+mod instructions;
+mod plain;
+#[cfg(test)]
+mod tests;
+#[cfg(target_arch = "x86_64")]
+mod x86;
+
+pub use self::instructions::{InstructionSet, Instructions, Unavailable};
+pub(super) use self::plain::Plain;
+#[cfg(target_arch = "x86_64")]
+pub(super) use self::x86::{Avx2, Avx512};
+
+/// Numbers per group: the pixels of a block, row by row.
+pub(super) const LANES: usize = 16;
+
+/// Rows of a group, of as many lanes each.
+pub(super) const ROWS: usize = 4;
+
+/// A group in memory, on one cache line.
+#[derive(Clone, Debug, Default)]
+#[repr(C, align(64))]
+pub(super) struct Group(pub [f32; LANES]);
+
+/// A group of [`LANES`] single-precision numbers.
+///
+/// # Safety
+/// The methods of an implementation may only run inside a function compiled with its instruction set, on a machine
+/// that has it; [`simd_kernel!`] is the only place that chooses one.
+pub(super) trait Simd: Copy {
+    /// One flag per lane.
+    type Mask: Copy;
+    fn splat(value: f32) -> Self;
+    fn load(from: &[f32; LANES]) -> Self;
+    fn store(self, to: &mut [f32; LANES]);
+    fn add(self, other: Self) -> Self;
+    fn sub(self, other: Self) -> Self;
+    fn mul(self, other: Self) -> Self;
+    fn sqrt(self) -> Self;
+    fn floor(self) -> Self;
+    fn ceil(self) -> Self;
+    /// Whole numbers from -2³¹ to below 2³¹.
+    fn store_integers(self, to: &mut [i32; LANES]);
+    /// `self * factor + term`, rounded once where the instruction set can.
+    fn mul_add(self, factor: Self, term: Self) -> Self;
+    /// The larger; `other` where `self` is NaN.
+    fn max(self, other: Self) -> Self;
+    /// The smaller; `other` where `self` is NaN.
+    fn min(self, other: Self) -> Self;
+    fn ge(self, other: Self) -> Self::Mask;
+    fn lt(self, other: Self) -> Self::Mask;
+    fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
+    fn any(mask: Self::Mask) -> bool;
+    /// `yes` where the flag is set, else `no`.
+    fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
+    /// Adds the low bits of `rounded` to the exponent of `self`.
+    fn add_to_exponent(self, rounded: Self) -> Self;
+
+    /// Row `r` of the result holds row `r` of each argument, a row being lanes 0 to 3, 4 to 7, 8 to 11 or 12 to 15.
+    fn transpose(arguments: [Self; ROWS]) -> [Self; ROWS];
+    /// In each row, the sum of that row of each argument, taken as `(0 + 2) + (1 + 3)`.
+    fn row_sums(arguments: [Self; ROWS]) -> Self;
+
+    /// `2^x` for `x ≤ 127`, relative error below 2.5e-7 for `x ≥ -126`; smaller and NaN arguments give `2^-126`.
+    ///
+    /// Splits off the nearest integer by the addition of `1.5 · 2²³` and evaluates the Taylor polynomial of degree 6 on
+    /// `[-1/2, 1/2]`, whose remainder `(ln 2 / 2)^7 / 7!` is 1.2e-7 relative at the ends.
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        let round = Self::splat(12_582_912.0);
+        let x = self.max(Self::splat(-126.0));
+        let rounded = x.add(round);
+        let fraction = x.sub(rounded.sub(round));
+        let mut power = Self::splat(1.540_353e-4);
+        power = power.mul_add(fraction, Self::splat(1.333_355_8e-3));
+        power = power.mul_add(fraction, Self::splat(9.618_129e-3));
+        power = power.mul_add(fraction, Self::splat(5.550_410_9e-2));
+        power = power.mul_add(fraction, Self::splat(2.402_265_1e-1));
+        power = power.mul_add(fraction, Self::splat(6.931_472e-1));
+        power = power.mul_add(fraction, Self::splat(1.0));
+        power.add_to_exponent(rounded)
+    }
+}
+
+/// Asks for the memory of a value that will be read soon.
+#[inline(always)]
+pub(super) fn prefetch<T>(value: &T) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let address = std::ptr::from_ref(value).cast::<i8>();
+        for line in 0..size_of::<T>().div_ceil(64) {
+            // SAFETY: SSE is part of x86-64; a prefetch reads nothing, and the address lies within the value.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(address.add(64 * line)) };
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
+}
+
+/// Defines `$name(instructions, arguments)` as the compilation of the generic kernel `$kernel::<impl Simd>` for an
+/// instruction set.
+macro_rules! simd_kernel {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident($($argument:ident: $type:ty),* $(,)?) = $kernel:ident) => {
+        $(#[$meta])*
+        $vis fn $name(instructions: $crate::raster::lanes::Instructions, $($argument: $type),*) {
+            #[cfg(target_arch = "x86_64")]
+            {
+                use $crate::raster::lanes::{Avx2, Avx512, InstructionSet};
+                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+                fn avx512($($argument: $type),*) {
+                    $kernel::<Avx512>($($argument),*);
+                }
+                #[target_feature(enable = "avx2,fma")]
+                fn avx2($($argument: $type),*) {
+                    $kernel::<Avx2>($($argument),*);
+                }
+                match instructions.set() {
+                    // SAFETY: `Instructions` exist only for sets that the machine was seen to have.
+                    InstructionSet::Avx512 => return unsafe { avx512($($argument),*) },
+                    // SAFETY: as above.
+                    InstructionSet::Avx2 => return unsafe { avx2($($argument),*) },
+                    InstructionSet::Baseline => {}
+                }
+            }
+            #[cfg(not(target_arch = "x86_64"))]
+            let _ = instructions;
+            $kernel::<$crate::raster::lanes::Plain>($($argument),*);
+        }
+    };
+}
+pub(super) use simd_kernel;

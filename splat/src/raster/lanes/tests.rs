@@ -1,0 +1,93 @@
+use super::*;
+
+fn power(x: f32) -> f32 {
+    let mut lanes = [0.0; LANES];
+    Plain::splat(x).exp2().store(&mut lanes);
+    lanes[7]
+}
+
+#[test]
+fn exp2_stays_within_its_bound_over_the_whole_range() {
+    for step in 0..=1_260_000 {
+        let x = -126.0 + step as f32 * 1e-4;
+        let relative = (f64::from(power(x)) / f64::from(x).exp2() - 1.0).abs();
+        assert!(relative < 2.5e-7, "2^{x}: {relative:e}");
+    }
+}
+
+#[test]
+fn exp2_of_what_is_no_small_number_is_tiny() {
+    for x in [f32::NAN, f32::NEG_INFINITY, -1e30, -127.0] {
+        assert_eq!(power(x), f32::MIN_POSITIVE, "2^{x}");
+    }
+}
+
+/// Runs every operation of an instruction set on the same numbers as [`Plain`].
+#[inline(always)]
+fn same_as_plain<S: Simd>() {
+    let a: [f32; LANES] = std::array::from_fn(|lane| (lane as f32 - 7.3) * 1.7);
+    let b: [f32; LANES] = std::array::from_fn(|lane| 3.1 - lane as f32 * 0.37);
+    let run = |operation: &str, fast: S, plain: Plain| {
+        let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
+        fast.store(&mut x);
+        plain.store(&mut y);
+        for lane in 0..LANES {
+            // A fused multiply-add rounds once instead of twice; exp2 is a chain of six of them.
+            let bound = 1e-5 * y[lane].abs().max(1e-6);
+            assert!((x[lane] - y[lane]).abs() <= bound, "{operation} lane {lane}: {} {}", x[lane], y[lane]);
+        }
+    };
+    let (s, t, p, q) = (S::load(&a), S::load(&b), Plain::load(&a), Plain::load(&b));
+    run("add", s.add(t), p.add(q));
+    run("sub", s.sub(t), p.sub(q));
+    run("mul", s.mul(t), p.mul(q));
+    run("mul_add", s.mul_add(t, s), p.mul_add(q, p));
+    run("max", s.max(t), p.max(q));
+    run("min", s.min(t), p.min(q));
+    run("exp2", s.exp2(), p.exp2());
+    run("ge", S::select(s.ge(t), s, t), Plain::select(p.ge(q), p, q));
+    run("lt", S::select(s.lt(t), s, t), Plain::select(p.lt(q), p, q));
+    run(
+        "both",
+        S::select(S::both(s.ge(t), s.lt(S::splat(9.0))), s, t),
+        Plain::select(Plain::both(p.ge(q), p.lt(Plain::splat(9.0))), p, q),
+    );
+    assert_eq!(S::any(s.ge(S::splat(100.0))), Plain::any(p.ge(Plain::splat(100.0))), "none");
+    assert_eq!(S::any(s.ge(S::splat(12.0))), Plain::any(p.ge(Plain::splat(12.0))), "one lane");
+    run("sqrt", s.mul(s).sqrt(), p.mul(p).sqrt());
+    run("floor", s.floor(), p.floor());
+    run("ceil", s.ceil(), p.ceil());
+    let (mut integers, mut expected) = ([0; LANES], [0; LANES]);
+    s.floor().store_integers(&mut integers);
+    p.floor().store_integers(&mut expected);
+    assert_eq!(integers, expected);
+    // The order of the sums is part of the contract: bit for bit.
+    let (f, g) = ([s, t, s.add(t), s.mul(t)], [p, q, p.add(q), p.mul(q)]);
+    assert_eq!(S::transpose(f).map(lanes), Plain::transpose(g).map(lanes));
+    assert_eq!(lanes(S::row_sums(f)), lanes(Plain::row_sums(g)));
+    assert_eq!(lanes(S::transpose([s, t, s, t])[2])[..5], [a[8], a[9], a[10], a[11], b[8]]);
+}
+
+fn lanes(values: impl Simd) -> [f32; LANES] {
+    let mut lanes = [0.0; LANES];
+    values.store(&mut lanes);
+    lanes
+}
+
+simd_kernel! { fn compare() = same_as_plain }
+
+#[test]
+fn every_instruction_set_of_this_machine_agrees_with_plain_arrays() {
+    for instructions in Instructions::available() {
+        compare(instructions);
+    }
+}
+
+#[test]
+fn instruction_sets_have_names_and_unknown_ones_are_refused() {
+    for set in InstructionSet::ALL {
+        assert_eq!(set.to_string().parse(), Ok(set));
+    }
+    assert!("avx".parse::<InstructionSet>().is_err_and(|error| error.contains("baseline")));
+    assert_eq!(Instructions::require(Instructions::detect().set()), Ok(Instructions::detect()));
+}
