@@ -12,7 +12,10 @@ use splat::{
 use tonic::Status;
 use trackersplat_proto::v1::{SubmitRequest, SubmitResponse, submit_request::Tracks};
 
-use super::state_failed;
+use super::{
+    locate::{LocatedClip, local_path},
+    state_failed,
+};
 use crate::{
     assembly::SEQUENCE,
     hub::{Hub, SharedHub},
@@ -35,13 +38,34 @@ struct Submission {
     output_request: String,
 }
 
-pub(super) async fn submit(hub: &SharedHub, request: SubmitRequest) -> Result<SubmitResponse, Status> {
+/// Refuses what cannot be meant, before a clip is copied for it.
+pub(super) fn check(request: &SubmitRequest) -> Result<(), Status> {
+    read_settings(&request.settings_json)?;
+    read_frames(request.first_frame, request.last_frame)?;
+    let files: &[String] = match &request.tracks {
+        Some(Tracks::TrackFiles(files)) => &files.paths,
+        Some(Tracks::ExactTracks(_)) | None => &[],
+    };
+    let files = files.iter().map(|file| ("tracks", file));
+    let given = [("static model", &request.static_model), ("output", &request.output)].into_iter();
+    for (what, path) in given.filter(|(_, path)| !path.is_empty()).chain(files) {
+        local_path(what, path)?;
+    }
+    Ok(())
+}
+
+pub(super) async fn submit(
+    hub: &SharedHub,
+    request: SubmitRequest,
+    clip: LocatedClip,
+) -> Result<SubmitResponse, Status> {
     if hub.shutdown.is_cancelled() {
         return Err(Status::unavailable("the coordinator shuts down; submit again when it is back"));
     }
     let _one_at_a_time = hub.submitting.lock().await;
     let scratch = hub.scratch_folder();
-    let reading = tokio::task::spawn_blocking(move || read(request, scratch)).await;
+    let clip_path = clip.path.clone();
+    let reading = tokio::task::spawn_blocking(move || read(request, clip_path, scratch)).await;
     let submission =
         reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))??;
     let known = hub
@@ -116,9 +140,8 @@ async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) 
     output::claim(output, &marker).map_err(refused)
 }
 
-fn read(request: SubmitRequest, scratch: PathBuf) -> Result<Submission, Status> {
+fn read(request: SubmitRequest, clip_path: PathBuf, scratch: PathBuf) -> Result<Submission, Status> {
     let settings = read_settings(&request.settings_json)?;
-    let clip_path = local_path("clip", &request.clip)?;
     let mut job_request = JobRequest {
         frames: read_frames(request.first_frame, request.last_frame)?,
         test_views: request.test_views,
@@ -212,57 +235,11 @@ fn read_file(what: &str, path: &Path) -> Result<InputFile, Status> {
     })
 }
 
-/// An absolute path from a path or a `file://` URL.
-fn local_path(what: &str, given: &str) -> Result<PathBuf, Status> {
-    let wrong = |reason: &str| {
-        Status::invalid_argument(format!(
-            "{what} '{given}' {reason}; give a path on the coordinator's machine or a file:// URL"
-        ))
-    };
-    let path = match given.split_once("://") {
-        Some(("file", path)) => percent_decoded(path).ok_or_else(|| wrong("is no valid URL"))?,
-        Some(_) => return Err(wrong("is of a kind that is not supported")),
-        None => given.to_owned(),
-    };
-    if path.is_empty() {
-        return Err(wrong("is empty"));
-    }
-    std::path::absolute(&path).map_err(|error| wrong(&error.to_string()))
-}
-
-/// `%20` and the like as the bytes they stand for.
-fn percent_decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.as_bytes();
-    while let Some((&first, tail)) = rest.split_first() {
-        rest = tail;
-        if first != b'%' {
-            bytes.push(first);
-            continue;
-        }
-        let digits = tail.get(..2)?;
-        bytes.push(u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?);
-        rest = &tail[2..];
-    }
-    String::from_utf8(bytes).ok()
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
 
     use super::*;
-
-    #[test]
-    fn paths_and_file_urls_are_absolute_local_paths() {
-        assert_eq!(local_path("clip", "file:///a%20b/c").unwrap(), Path::new("/a b/c"));
-        assert_eq!(local_path("clip", "/a b/c").unwrap(), Path::new("/a b/c"));
-        assert!(local_path("clip", "relative").unwrap().is_absolute());
-        for wrong in ["", "s3://bucket/clip", "file:///a%2", "file:///a%zz", "file://"] {
-            let status = local_path("clip", wrong).unwrap_err();
-            assert_eq!(status.code(), tonic::Code::InvalidArgument, "{wrong}");
-        }
-    }
 
     #[test]
     fn an_unknown_setting_is_named() {

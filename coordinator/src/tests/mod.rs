@@ -3,6 +3,7 @@
 mod harness;
 mod jobs;
 mod leases;
+mod remote_clips;
 mod restart;
 mod runs;
 mod transfers;
