@@ -23,6 +23,8 @@ pub(crate) enum OutputError {
     OtherClip {
         /// The folder.
         output: PathBuf,
+        /// The job whose results it holds.
+        job_id: String,
         /// Path of the clip whose results it holds.
         owner: String,
         /// Its digest.
@@ -61,6 +63,16 @@ pub(crate) enum OutputError {
     },
 }
 
+impl OutputError {
+    /// The job that a folder belongs to.
+    pub(crate) fn owner(&self) -> Option<&str> {
+        match self {
+            Self::OtherClip { job_id, .. } | Self::OtherSettings { job_id, .. } => Some(job_id),
+            Self::Unwritable { .. } | Self::BadMarker { .. } => None,
+        }
+    }
+}
+
 /// Whose results a folder holds.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Marker {
@@ -84,6 +96,7 @@ pub(crate) fn check_owner(output: &Path, wanted: &Marker) -> Result<(), OutputEr
     if marker.clip_digest != wanted.clip_digest {
         return Err(OutputError::OtherClip {
             output: output.to_owned(),
+            job_id: marker.job_id,
             owner: marker.clip,
             owner_digest: marker.clip_digest,
             clip: wanted.clip.clone(),
@@ -182,6 +195,7 @@ mod tests {
         let error = check_owner(folder.path(), &marker("b", "s")).unwrap_err().to_string();
         assert!(error.contains("/clips/a") && error.contains("/clips/b"), "{error}");
         let error = check_owner(folder.path(), &marker("a", "t")).unwrap_err();
+        assert_eq!(error.owner(), Some("job-1"));
         assert!(matches!(error, OutputError::OtherSettings { .. }), "{error}");
         assert_eq!(std::fs::read(folder.path().join(MARKER)).unwrap(), before);
     }

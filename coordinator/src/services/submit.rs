@@ -17,7 +17,7 @@ use super::{
     state_failed,
 };
 use crate::{
-    assembly::SEQUENCE,
+    assembly::{SEQUENCE, holds_results},
     hub::{Hub, SharedHub},
     keys::VERSION,
     output::{self, Marker, OutputError},
@@ -54,6 +54,18 @@ pub(super) fn check(request: &SubmitRequest) -> Result<(), Status> {
     Ok(())
 }
 
+impl Submission {
+    fn marker(&self, job_id: &str) -> Marker {
+        Marker {
+            job_id: job_id.to_owned(),
+            clip: self.clip_path.display().to_string(),
+            clip_digest: self.clip_digest.clone(),
+            settings_digest: self.settings_digest.clone(),
+            version: VERSION.to_owned(),
+        }
+    }
+}
+
 pub(super) async fn submit(
     hub: &SharedHub,
     request: SubmitRequest,
@@ -84,7 +96,9 @@ async fn resume(hub: &SharedHub, job: JobRecord, submission: Submission) -> Resu
     let output = PathBuf::from(&job.output);
     let response = SubmitResponse { job_id: job.id.clone(), resumed: true };
     // A finished job whose outputs were removed puts them together again.
-    let is_complete = state == JobState::Done && output.join(SEQUENCE).exists();
+    let is_complete = state == JobState::Done
+        && output.join(SEQUENCE).exists()
+        && output::check_owner(&output, &submission.marker(&job.id)).is_ok();
     if is_complete || !state.has_ended() {
         return Ok(response);
     }
@@ -119,18 +133,20 @@ async fn begin(hub: &SharedHub, submission: Submission) -> Result<SubmitResponse
     Ok(SubmitResponse { job_id: id, resumed: false })
 }
 
-/// Makes sure that the output folder is this job's, and marks it.
+/// Makes sure that the output folder is this job's, or nobody's who has results in it, and marks it.
 async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) -> Result<(), Status> {
-    let marker = Marker {
-        job_id: job_id.to_owned(),
-        clip: submission.clip_path.display().to_string(),
-        clip_digest: submission.clip_digest.clone(),
-        settings_digest: submission.settings_digest.clone(),
-        version: VERSION.to_owned(),
-    };
-    let active = hub.active_outputs().await.map_err(|error| state_failed(hub, error))?;
+    let marker = submission.marker(job_id);
     let refused = |error: OutputError| Status::failed_precondition(error.to_string());
-    output::check_owner(output, &marker).map_err(refused)?;
+    if let Err(error) = output::check_owner(output, &marker) {
+        let gives_way = match error.owner() {
+            Some(owner) if !holds_results(output) => hub.gives_way(owner).await,
+            _ => Ok(false),
+        };
+        if !gives_way.map_err(|error| state_failed(hub, error))? {
+            return Err(refused(error));
+        }
+    }
+    let active = hub.active_outputs().await.map_err(|error| state_failed(hub, error))?;
     if let Some((other, _)) = active.iter().find(|(other, folder)| folder == output && other != job_id) {
         return Err(Status::failed_precondition(format!(
             "job {other} is writing to the output folder {}; wait for it, cancel it, or give another folder",
