@@ -17,18 +17,16 @@ pub(crate) const MARKER: &str = "trackersplat.json";
 pub(crate) enum OutputError {
     /// It holds the results of another clip.
     #[error(
-        "the output folder {output} belongs to the clip {owner} (digest {owner_digest}), not to {clip} (digest {digest}); \
-         give another output folder"
+        "the output folder {output} belongs to the clip {} (digest {}), not to {clip} (digest {digest}); \
+         give another output folder",
+        .owner.clip,
+        .owner.clip_digest
     )]
     OtherClip {
         /// The folder.
         output: PathBuf,
         /// The job whose results it holds.
-        job_id: String,
-        /// Path of the clip whose results it holds.
-        owner: String,
-        /// Its digest.
-        owner_digest: String,
+        owner: Box<Marker>,
         /// Path of the submitted clip.
         clip: String,
         /// Its digest.
@@ -67,7 +65,8 @@ impl OutputError {
     /// The job that a folder belongs to.
     pub(crate) fn owner(&self) -> Option<&str> {
         match self {
-            Self::OtherClip { job_id, .. } | Self::OtherSettings { job_id, .. } => Some(job_id),
+            Self::OtherClip { owner, .. } => Some(&owner.job_id),
+            Self::OtherSettings { job_id, .. } => Some(job_id),
             Self::Unwritable { .. } | Self::BadMarker { .. } => None,
         }
     }
@@ -96,9 +95,7 @@ pub(crate) fn check_owner(output: &Path, wanted: &Marker) -> Result<(), OutputEr
     if marker.clip_digest != wanted.clip_digest {
         return Err(OutputError::OtherClip {
             output: output.to_owned(),
-            job_id: marker.job_id,
-            owner: marker.clip,
-            owner_digest: marker.clip_digest,
+            owner: Box::new(marker),
             clip: wanted.clip.clone(),
             digest: wanted.clip_digest.clone(),
         });

@@ -3,7 +3,7 @@
 use std::{error::Error, fmt, str::FromStr, sync::Arc, time::Duration};
 
 use object_store::{
-    ClientOptions, ObjectStore, ObjectStoreScheme, RetryConfig,
+    BackoffConfig, ClientOptions, ObjectStore, ObjectStoreScheme, RetryConfig,
     aws::{AmazonS3Builder, AmazonS3ConfigKey},
     azure::{AzureConfigKey, MicrosoftAzureBuilder},
     gcp::{GoogleCloudStorageBuilder, GoogleConfigKey},
@@ -14,8 +14,10 @@ use super::{ClipUrl, RemoteClipError};
 
 /// A silent connection counts as lost after this; a transfer may take as long as it moves.
 const READ_TIMEOUT: Duration = Duration::from_secs(30);
-/// Attempts at one request after the first: about a quarter of a minute with their pauses.
+/// Attempts at one request after the first.
 const RETRIES: usize = 6;
+/// Pause before the first of them; later ones are longer, some ten seconds together.
+const FIRST_PAUSE: Duration = Duration::from_millis(500);
 /// No further attempt at a request after this.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(60);
 /// Longest cause that an error repeats from a server, in characters.
@@ -63,7 +65,8 @@ pub(super) fn open(url: &ClipUrl, options: &StoreOptions) -> object_store::Resul
     // TLS needs one provider per process. One that the program has chosen stays.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let client = ClientOptions::new().with_timeout_disabled().with_read_timeout(READ_TIMEOUT);
-    let retry = RetryConfig { max_retries: RETRIES, retry_timeout: RETRY_TIMEOUT, ..RetryConfig::default() };
+    let backoff = BackoffConfig { init_backoff: FIRST_PAUSE, ..BackoffConfig::default() };
+    let retry = RetryConfig { backoff, max_retries: RETRIES, retry_timeout: RETRY_TIMEOUT };
     let address = url.url().as_str();
     Ok(match url.scheme() {
         ObjectStoreScheme::AmazonS3 => {
