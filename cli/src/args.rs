@@ -22,7 +22,8 @@ pub(crate) struct CoordinatorArgs {
 /// What to reconstruct and how.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JobArgs {
-    /// Folder of the clip: COLMAP, nerfstudio transforms, or LLFF/N3DV.
+    /// Folder of the clip (COLMAP, nerfstudio transforms, or LLFF/N3DV), or its URL: s3://, gs://, az://, abfss://, or
+    /// https:// of a WebDAV server, with credentials in the coordinator's environment.
     pub(crate) clip: String,
 
     /// Frames to reconstruct, first and last; the first is the key frame [default: all].

@@ -10,7 +10,7 @@ use trackersplat_coordinator::{Running, ServeOptions, serve};
 use trackersplat_proto::v1::{JobState, ListRequest, SubmitRequest, jobs_client::JobsClient};
 
 use crate::{
-    client, display,
+    client, display, environment,
     error::CliError,
     follow::follow,
     logs::LogArgs,
@@ -76,6 +76,8 @@ impl EmbeddedRun<'_> {
             root: state.to_owned(),
             listen: self.listen,
             dismiss_workers_when_idle: self.workers > 0,
+            replaces_abandoned_jobs: true,
+            stores: environment::stores(),
             ..ServeOptions::default()
         };
         Ok(serve(options, Arc::new(CpuEngine::default()), shutdown.clone()).await?)

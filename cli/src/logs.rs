@@ -24,12 +24,15 @@ pub(crate) struct LogArgs {
 /// Starts logging. `RUST_LOG` overrules the flags.
 ///
 /// A command that watches its own embedded coordinator hears every change twice; of the coordinator it then says
-/// warnings only.
+/// warnings only, and how far it is with copying a clip: nothing else is to be seen before that ends.
 pub(crate) fn start(args: &LogArgs, watches_own_coordinator: bool) {
     let level = level(args);
     let coordinator =
         if watches_own_coordinator && args.verbose == 0 { level.min(LevelFilter::WARN) } else { level };
-    let default = format!("{level},trackersplat_coordinator={coordinator}");
+    let copying = if args.quiet { level } else { level.max(LevelFilter::INFO) };
+    let default = format!(
+        "{level},trackersplat_coordinator={coordinator},trackersplat_coordinator::remote_clip={copying}"
+    );
     let wanted = std::env::var(EnvFilter::DEFAULT_ENV).unwrap_or(default);
     let filter = EnvFilter::builder().parse_lossy(wanted);
     let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);

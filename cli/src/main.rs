@@ -6,6 +6,7 @@ mod client;
 mod commands;
 mod display;
 mod embedded;
+mod environment;
 mod error;
 mod follow;
 mod frame_range;

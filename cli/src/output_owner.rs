@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use splat::clip::ClipOptions;
-use trackersplat_coordinator::assembly::sequence::Sequence;
+use trackersplat_coordinator::assembly::{holds_results, sequence::Sequence};
 use trackersplat_proto::v1::SubmitRequest;
 
-use crate::{error::CliError, scratch};
+use crate::{embedded::STATE_FOLDER, error::CliError, scratch};
 
 /// File that the coordinator marks an output folder with.
 const MARKER: &str = "trackersplat.json";
@@ -21,12 +21,14 @@ struct Owner {
 
 /// Refuses a folder with the results of another clip than the submission's. Touches nothing.
 ///
-/// The coordinator refuses it too, but only once it serves, and by then it goes on with the folder's unfinished job.
+/// The coordinator refuses it too, but only once it serves, and by then it goes on with the folder's unfinished job. A
+/// run whose state is in the folder without results there may give way: that is the coordinator's to decide.
 pub(crate) fn check(output: &Path, request: &SubmitRequest) -> Result<(), CliError> {
     let Some(owner) = owner(output) else { return Ok(()) };
     let Some(clip) = local_path(&request.clip) else { return Ok(()) };
     let digest = digest(&clip, request)?;
-    if digest == owner.clip_digest {
+    let may_give_way = output.join(STATE_FOLDER).is_dir() && !holds_results(output);
+    if digest == owner.clip_digest || may_give_way {
         return Ok(());
     }
     Err(CliError::bad_input(
@@ -101,6 +103,11 @@ mod tests {
             assert!(error.to_string().contains(part), "{error}");
         }
         assert_eq!(std::fs::read_dir(output.path()).unwrap().count(), 1, "nothing is created");
+
+        std::fs::create_dir(output.path().join(STATE_FOLDER)).unwrap();
+        check(output.path(), &request).unwrap();
+        std::fs::write(output.path().join("static.ply"), "").unwrap();
+        check(output.path(), &request).unwrap_err();
     }
 
     #[test]

@@ -9,6 +9,7 @@
 //! | `hub` | where jobs, workers and clients meet: one lock orders every change |
 //! | `driver` | a job from submission to its end, one file per stage |
 //! | `services` | the gRPC services of `trackersplat.v1`; `proto/PROTOCOL.md` is their reference |
+//! | `remote_clip` | a clip in an object store becomes a local one |
 //! | [`assembly`] | the finished frames become files |
 
 pub mod assembly;
@@ -22,6 +23,7 @@ mod keys;
 mod options;
 mod output;
 pub mod queue;
+mod remote_clip;
 mod request;
 mod serve;
 mod services;
@@ -30,4 +32,5 @@ pub mod store;
 mod tests;
 
 pub use options::ServeOptions;
+pub use remote_clip::StoreOptions;
 pub use serve::{Running, ServeError, serve};

@@ -2,10 +2,12 @@
 
 use std::{net::SocketAddr, path::PathBuf, time::Duration};
 
+use crate::remote_clip::StoreOptions;
+
 /// How a coordinator is set up.
 #[derive(Clone, Debug)]
 pub struct ServeOptions {
-    /// Folder of the coordinator's state: `state.sqlite`, `blobs/`, and `jobs/` for jobs without an output folder.
+    /// Folder of the coordinator's state: `state.sqlite`, `blobs/`, `clips/` for copies from object stores, and `jobs/` for jobs without an output folder.
     pub root: PathBuf,
     /// Where to listen; port 0 lets the system choose.
     pub listen: SocketAddr,
@@ -22,6 +24,11 @@ pub struct ServeOptions {
     /// Embedded mode: no other workers will ever join. They are dismissed when the last job has ended, and a frame
     /// that none of them has the resources for fails instead of waiting.
     pub dismiss_workers_when_idle: bool,
+    /// Embedded mode: the run that embeds the coordinator is its only client. A job that an earlier run left behind
+    /// without a finished frame is cancelled when another submission asks for its output folder.
+    pub replaces_abandoned_jobs: bool,
+    /// How object stores are reached that clips are submitted from.
+    pub stores: StoreOptions,
 }
 
 impl Default for ServeOptions {
@@ -35,6 +42,8 @@ impl Default for ServeOptions {
             reconnect_grace: Duration::from_secs(3),
             max_attempts: 3,
             dismiss_workers_when_idle: false,
+            replaces_abandoned_jobs: false,
+            stores: StoreOptions::default(),
         }
     }
 }

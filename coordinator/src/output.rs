@@ -17,16 +17,16 @@ pub(crate) const MARKER: &str = "trackersplat.json";
 pub(crate) enum OutputError {
     /// It holds the results of another clip.
     #[error(
-        "the output folder {output} belongs to the clip {owner} (digest {owner_digest}), not to {clip} (digest {digest}); \
-         give another output folder"
+        "the output folder {output} belongs to the clip {} (digest {}), not to {clip} (digest {digest}); \
+         give another output folder",
+        .owner.clip,
+        .owner.clip_digest
     )]
     OtherClip {
         /// The folder.
         output: PathBuf,
-        /// Path of the clip whose results it holds.
-        owner: String,
-        /// Its digest.
-        owner_digest: String,
+        /// The job whose results it holds.
+        owner: Box<Marker>,
         /// Path of the submitted clip.
         clip: String,
         /// Its digest.
@@ -61,6 +61,17 @@ pub(crate) enum OutputError {
     },
 }
 
+impl OutputError {
+    /// The job that a folder belongs to.
+    pub(crate) fn owner(&self) -> Option<&str> {
+        match self {
+            Self::OtherClip { owner, .. } => Some(&owner.job_id),
+            Self::OtherSettings { job_id, .. } => Some(job_id),
+            Self::Unwritable { .. } | Self::BadMarker { .. } => None,
+        }
+    }
+}
+
 /// Whose results a folder holds.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Marker {
@@ -84,8 +95,7 @@ pub(crate) fn check_owner(output: &Path, wanted: &Marker) -> Result<(), OutputEr
     if marker.clip_digest != wanted.clip_digest {
         return Err(OutputError::OtherClip {
             output: output.to_owned(),
-            owner: marker.clip,
-            owner_digest: marker.clip_digest,
+            owner: Box::new(marker),
             clip: wanted.clip.clone(),
             digest: wanted.clip_digest.clone(),
         });
@@ -182,6 +192,7 @@ mod tests {
         let error = check_owner(folder.path(), &marker("b", "s")).unwrap_err().to_string();
         assert!(error.contains("/clips/a") && error.contains("/clips/b"), "{error}");
         let error = check_owner(folder.path(), &marker("a", "t")).unwrap_err();
+        assert_eq!(error.owner(), Some("job-1"));
         assert!(matches!(error, OutputError::OtherSettings { .. }), "{error}");
         assert_eq!(std::fs::read(folder.path().join(MARKER)).unwrap(), before);
     }

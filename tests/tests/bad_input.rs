@@ -73,6 +73,17 @@ fn a_truncated_image() {
     let bytes = std::fs::read(&file).unwrap();
     std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
     scratch.refuses(&["--tracks", "exact"], &["frame_0002.webp"]);
+
+    // The same command, once the image is repaired.
+    std::fs::write(&file, bytes).unwrap();
+    let (clip, output) = (scratch.folder.path().join("clip"), scratch.folder.path().join("out"));
+    let fixed =
+        ["reconstruct", clip.to_str().unwrap(), "--out", output.to_str().unwrap(), "--tracks", "exact"];
+    for _ in 0..2 {
+        let (code, log) = program::run(fixed.iter().chain(&QUICK));
+        assert_eq!(code, 0, "{log}");
+    }
+    assert!(output.join("frames/frame_0002.ply").exists());
 }
 
 #[test]

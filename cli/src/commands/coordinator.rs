@@ -7,7 +7,7 @@ use splat::raster::CpuEngine;
 use trackersplat_coordinator::{ServeOptions, serve};
 
 use super::cores;
-use crate::{error::CliError, interrupt, stdout};
+use crate::{environment, error::CliError, interrupt, stdout};
 
 /// Arguments of `coordinator`.
 #[derive(Args, Debug)]
@@ -51,7 +51,8 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
         lease_duration: args.lease_duration,
         reconnect_grace: args.reconnect_grace,
         max_attempts: args.max_attempts,
-        dismiss_workers_when_idle: false,
+        stores: environment::stores(),
+        ..ServeOptions::default()
     };
     let running = serve(options, Arc::new(CpuEngine::default()), interrupted).await?;
     // For scripts that let the system choose the port.

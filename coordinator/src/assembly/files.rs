@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::AssemblyError;
+use super::{AssemblyError, CONTACT_SHEET, METRICS, SEQUENCE, STATIC_MODEL};
 
 /// `frames/frame_0001.ply`, relative to the output folder.
 pub fn frame_path(number: u32) -> PathBuf {
@@ -16,6 +16,14 @@ pub fn frame_path(number: u32) -> PathBuf {
 /// `deltas/frame_0001.delta`, relative to the output folder.
 pub fn delta_path(number: u32) -> PathBuf {
     Path::new("deltas").join(format!("frame_{number:04}.delta"))
+}
+
+/// Whether an output folder holds anything that a job computed.
+pub fn holds_results(output: &Path) -> bool {
+    let files = [STATIC_MODEL, SEQUENCE, METRICS, CONTACT_SHEET].map(|name| output.join(name));
+    let folders = [frame_path(1), delta_path(1)];
+    let folders = folders.iter().filter_map(|file| file.parent()).map(|folder| output.join(folder));
+    files.into_iter().chain(folders).any(|path| path.exists())
 }
 
 /// Writes a file under a temporary name, then renames it; makes its folder if needed.
@@ -47,6 +55,18 @@ mod tests {
     fn names_sort_in_frame_order_and_grow_past_four_digits() {
         assert_eq!(frame_path(1), Path::new("frames/frame_0001.ply"));
         assert_eq!(delta_path(12_345), Path::new("deltas/frame_12345.delta"));
+    }
+
+    #[test]
+    fn results_are_known_by_their_names() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
+        assert!(!holds_results(folder.path()) && !holds_results(&folder.path().join("none")));
+        write_atomically(&folder.path().join(frame_path(7)), b"x").unwrap();
+        assert!(holds_results(folder.path()));
+        fs::remove_dir_all(folder.path().join("frames")).unwrap();
+        write_atomically(&folder.path().join(SEQUENCE), b"{}").unwrap();
+        assert!(holds_results(folder.path()));
     }
 
     #[test]

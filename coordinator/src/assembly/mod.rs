@@ -35,7 +35,7 @@ use splat::{
 };
 
 use self::files::write_atomically;
-pub use self::files::{delta_path, frame_path};
+pub use self::files::{delta_path, frame_path, holds_results};
 use crate::queue::frame::FrameState;
 
 /// The key frame's file in the output folder.

@@ -157,8 +157,8 @@ fn open_unchanged(path: &Path, options: &ClipOptions, submitted: &str) -> Result
     let digest = clip.digest().map_err(bad)?;
     if digest != submitted {
         return Err(StageError::bad_input(format!(
-            "the clip {} has changed since the job was submitted (digest {digest}, was {submitted}); submit it again \
-             with another output folder",
+            "the clip {} has changed since the job was submitted (digest {digest}, was {submitted}); submit it again, \
+             with another output folder if frames of it are finished",
             path.display()
         )));
     }

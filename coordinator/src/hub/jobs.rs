@@ -180,6 +180,23 @@ impl Hub {
         Ok(outputs)
     }
 
+    /// Whether a job lets another one have its output folder: it is one of this coordinator's, has no finished frame,
+    /// and has ended. An embedded coordinator ends one that an earlier run has left behind.
+    pub(crate) async fn gives_way(&self, job: &str) -> Result<bool, StoreError> {
+        let Some(record) = self.store.job(job).await? else { return Ok(false) };
+        if !record.state()?.has_ended() {
+            if !self.options.replaces_abandoned_jobs || self.store.has_finished_frame(job).await? {
+                return Ok(false);
+            }
+            tracing::warn!(
+                job_id = job,
+                "another submission takes the output folder of this job, which ends"
+            );
+            self.cancel_job(&job.into()).await?;
+        }
+        Ok(!self.store.has_finished_frame(job).await?)
+    }
+
     fn retire(&self, desk: &mut Desk, job: &JobId) {
         if let Some(active) = desk.active.remove(job) {
             active.stop.cancel();

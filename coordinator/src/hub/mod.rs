@@ -90,6 +90,8 @@ pub(crate) struct Hub {
     pub(crate) turn: Semaphore,
     /// One submission at a time, so that the same one twice is one job.
     pub(crate) submitting: tokio::sync::Mutex<()>,
+    /// One submission from an object store at a time, so that no copy changes while another reads it.
+    pub(crate) copying: Arc<tokio::sync::Mutex<()>>,
     pub(crate) probe: Blob,
     desk: tokio::sync::Mutex<Desk>,
     notices: broadcast::Sender<Notice>,
@@ -128,6 +130,7 @@ impl Hub {
             shutdown,
             turn: Semaphore::new(1),
             submitting: tokio::sync::Mutex::new(()),
+            copying: Arc::default(),
             probe,
             desk: tokio::sync::Mutex::new(desk),
             notices: broadcast::Sender::new(NOTICES),
@@ -151,10 +154,15 @@ impl Hub {
         self.options.root.join("decoded")
     }
 
+    /// Folder of clips that were copied from object stores.
+    pub(crate) fn clip_folder(&self) -> PathBuf {
+        self.options.root.join("clips")
+    }
+
     /// Paths under the root that are no job's output.
     pub(crate) fn private_paths(&self) -> Vec<PathBuf> {
         let root = &self.options.root;
-        ["state.sqlite", "state.sqlite-wal", "state.sqlite-shm", "lock", "blobs", "decoded", "jobs"]
+        ["state.sqlite", "state.sqlite-wal", "state.sqlite-shm", "lock", "blobs", "clips", "decoded", "jobs"]
             .map(|name| root.join(name))
             .into()
     }

@@ -7,7 +7,7 @@ use trackersplat_proto::v1::{
     SubmitRequest, SubmitResponse, WatchRequest, jobs_server::Jobs,
 };
 
-use super::{fetch, state_failed, submit, uninterrupted, unknown_job, watch};
+use super::{fetch, locate::locate_clip, state_failed, submit, uninterrupted, unknown_job, watch};
 use crate::{
     hub::SharedHub,
     store::{JobRecord, StoreError, Summary},
@@ -35,10 +35,11 @@ impl Jobs for JobService {
     type FetchStream = ReceiverStream<Result<FetchChunk, Status>>;
 
     async fn submit(&self, request: Request<SubmitRequest>) -> Result<Response<SubmitResponse>, Status> {
-        let hub = self.hub.clone();
-        uninterrupted(async move { submit::submit(&hub, request.into_inner()).await })
-            .await
-            .map(Response::new)
+        let (hub, request) = (self.hub.clone(), request.into_inner());
+        submit::check(&request)?;
+        // Copying a clip may take long: it ends when the client hangs up.
+        let clip = locate_clip(&hub, &request.clip).await?;
+        uninterrupted(async move { submit::submit(&hub, request, clip).await }).await.map(Response::new)
     }
 
     async fn watch(&self, request: Request<WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {

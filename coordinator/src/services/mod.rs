@@ -3,6 +3,7 @@
 mod blobs;
 mod fetch;
 mod jobs;
+mod locate;
 mod submit;
 mod watch;
 mod work;

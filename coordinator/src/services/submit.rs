@@ -12,9 +12,12 @@ use splat::{
 use tonic::Status;
 use trackersplat_proto::v1::{SubmitRequest, SubmitResponse, submit_request::Tracks};
 
-use super::state_failed;
+use super::{
+    locate::{LocatedClip, local_path},
+    state_failed,
+};
 use crate::{
-    assembly::SEQUENCE,
+    assembly::{SEQUENCE, holds_results},
     hub::{Hub, SharedHub},
     keys::VERSION,
     output::{self, Marker, OutputError},
@@ -35,13 +38,46 @@ struct Submission {
     output_request: String,
 }
 
-pub(super) async fn submit(hub: &SharedHub, request: SubmitRequest) -> Result<SubmitResponse, Status> {
+/// Refuses what cannot be meant, before a clip is copied for it.
+pub(super) fn check(request: &SubmitRequest) -> Result<(), Status> {
+    read_settings(&request.settings_json)?;
+    read_frames(request.first_frame, request.last_frame)?;
+    let files: &[String] = match &request.tracks {
+        Some(Tracks::TrackFiles(files)) => &files.paths,
+        Some(Tracks::ExactTracks(_)) | None => &[],
+    };
+    let files = files.iter().map(|file| ("tracks", file));
+    let given = [("static model", &request.static_model), ("output", &request.output)].into_iter();
+    for (what, path) in given.filter(|(_, path)| !path.is_empty()).chain(files) {
+        local_path(what, path)?;
+    }
+    Ok(())
+}
+
+impl Submission {
+    fn marker(&self, job_id: &str) -> Marker {
+        Marker {
+            job_id: job_id.to_owned(),
+            clip: self.clip_path.display().to_string(),
+            clip_digest: self.clip_digest.clone(),
+            settings_digest: self.settings_digest.clone(),
+            version: VERSION.to_owned(),
+        }
+    }
+}
+
+pub(super) async fn submit(
+    hub: &SharedHub,
+    request: SubmitRequest,
+    clip: LocatedClip,
+) -> Result<SubmitResponse, Status> {
     if hub.shutdown.is_cancelled() {
         return Err(Status::unavailable("the coordinator shuts down; submit again when it is back"));
     }
     let _one_at_a_time = hub.submitting.lock().await;
     let scratch = hub.scratch_folder();
-    let reading = tokio::task::spawn_blocking(move || read(request, scratch)).await;
+    let clip_path = clip.path.clone();
+    let reading = tokio::task::spawn_blocking(move || read(request, clip_path, scratch)).await;
     let submission =
         reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))??;
     let known = hub
@@ -60,7 +96,9 @@ async fn resume(hub: &SharedHub, job: JobRecord, submission: Submission) -> Resu
     let output = PathBuf::from(&job.output);
     let response = SubmitResponse { job_id: job.id.clone(), resumed: true };
     // A finished job whose outputs were removed puts them together again.
-    let is_complete = state == JobState::Done && output.join(SEQUENCE).exists();
+    let is_complete = state == JobState::Done
+        && output.join(SEQUENCE).exists()
+        && output::check_owner(&output, &submission.marker(&job.id)).is_ok();
     if is_complete || !state.has_ended() {
         return Ok(response);
     }
@@ -95,18 +133,20 @@ async fn begin(hub: &SharedHub, submission: Submission) -> Result<SubmitResponse
     Ok(SubmitResponse { job_id: id, resumed: false })
 }
 
-/// Makes sure that the output folder is this job's, and marks it.
+/// Makes sure that the output folder is this job's, or nobody's who has results in it, and marks it.
 async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) -> Result<(), Status> {
-    let marker = Marker {
-        job_id: job_id.to_owned(),
-        clip: submission.clip_path.display().to_string(),
-        clip_digest: submission.clip_digest.clone(),
-        settings_digest: submission.settings_digest.clone(),
-        version: VERSION.to_owned(),
-    };
-    let active = hub.active_outputs().await.map_err(|error| state_failed(hub, error))?;
+    let marker = submission.marker(job_id);
     let refused = |error: OutputError| Status::failed_precondition(error.to_string());
-    output::check_owner(output, &marker).map_err(refused)?;
+    if let Err(error) = output::check_owner(output, &marker) {
+        let gives_way = match error.owner() {
+            Some(owner) if !holds_results(output) => hub.gives_way(owner).await,
+            _ => Ok(false),
+        };
+        if !gives_way.map_err(|error| state_failed(hub, error))? {
+            return Err(refused(error));
+        }
+    }
+    let active = hub.active_outputs().await.map_err(|error| state_failed(hub, error))?;
     if let Some((other, _)) = active.iter().find(|(other, folder)| folder == output && other != job_id) {
         return Err(Status::failed_precondition(format!(
             "job {other} is writing to the output folder {}; wait for it, cancel it, or give another folder",
@@ -116,9 +156,8 @@ async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) 
     output::claim(output, &marker).map_err(refused)
 }
 
-fn read(request: SubmitRequest, scratch: PathBuf) -> Result<Submission, Status> {
+fn read(request: SubmitRequest, clip_path: PathBuf, scratch: PathBuf) -> Result<Submission, Status> {
     let settings = read_settings(&request.settings_json)?;
-    let clip_path = local_path("clip", &request.clip)?;
     let mut job_request = JobRequest {
         frames: read_frames(request.first_frame, request.last_frame)?,
         test_views: request.test_views,
@@ -212,57 +251,11 @@ fn read_file(what: &str, path: &Path) -> Result<InputFile, Status> {
     })
 }
 
-/// An absolute path from a path or a `file://` URL.
-fn local_path(what: &str, given: &str) -> Result<PathBuf, Status> {
-    let wrong = |reason: &str| {
-        Status::invalid_argument(format!(
-            "{what} '{given}' {reason}; give a path on the coordinator's machine or a file:// URL"
-        ))
-    };
-    let path = match given.split_once("://") {
-        Some(("file", path)) => percent_decoded(path).ok_or_else(|| wrong("is no valid URL"))?,
-        Some(_) => return Err(wrong("is of a kind that is not supported")),
-        None => given.to_owned(),
-    };
-    if path.is_empty() {
-        return Err(wrong("is empty"));
-    }
-    std::path::absolute(&path).map_err(|error| wrong(&error.to_string()))
-}
-
-/// `%20` and the like as the bytes they stand for.
-fn percent_decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.as_bytes();
-    while let Some((&first, tail)) = rest.split_first() {
-        rest = tail;
-        if first != b'%' {
-            bytes.push(first);
-            continue;
-        }
-        let digits = tail.get(..2)?;
-        bytes.push(u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?);
-        rest = &tail[2..];
-    }
-    String::from_utf8(bytes).ok()
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, reason = "tests")]
 
     use super::*;
-
-    #[test]
-    fn paths_and_file_urls_are_absolute_local_paths() {
-        assert_eq!(local_path("clip", "file:///a%20b/c").unwrap(), Path::new("/a b/c"));
-        assert_eq!(local_path("clip", "/a b/c").unwrap(), Path::new("/a b/c"));
-        assert!(local_path("clip", "relative").unwrap().is_absolute());
-        for wrong in ["", "s3://bucket/clip", "file:///a%2", "file:///a%zz", "file://"] {
-            let status = local_path("clip", wrong).unwrap_err();
-            assert_eq!(status.code(), tonic::Code::InvalidArgument, "{wrong}");
-        }
-    }
 
     #[test]
     fn an_unknown_setting_is_named() {

@@ -160,6 +160,12 @@ impl Store {
         Ok(query.fetch_optional(&self.pool).await?)
     }
 
+    /// Whether a job has a frame that is done.
+    pub async fn has_finished_frame(&self, job: &str) -> Result<bool, StoreError> {
+        let sql = "SELECT EXISTS (SELECT 1 FROM frames WHERE job_id = ? AND state = 'done')";
+        Ok(sqlx::query_scalar(sql).bind(job).fetch_one(&self.pool).await?)
+    }
+
     /// Whether a lease's result was committed, for a report that comes again.
     pub async fn was_committed(&self, lease_id: &str, attempt: u32) -> Result<bool, StoreError> {
         let sql = "SELECT COUNT(*) FROM attempts WHERE lease_id = ? AND attempt = ? AND outcome = 'done'";

@@ -3,6 +3,8 @@
 mod harness;
 mod jobs;
 mod leases;
+mod ownership;
+mod remote_clips;
 mod restart;
 mod runs;
 mod transfers;
