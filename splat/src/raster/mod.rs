@@ -11,6 +11,7 @@ pub mod bin;
 pub mod blend;
 pub mod blend_backward;
 mod colour;
+mod counts;
 mod engine;
 pub mod footprint_moments;
 mod lanes;
@@ -21,6 +22,7 @@ mod session;
 #[cfg(test)]
 mod tests;
 
+pub use counts::{PairCounts, pair_counts};
 pub use engine::{CpuEngine, render, render_backward};
 pub use pass::Pass;
 
