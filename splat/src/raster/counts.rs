@@ -140,7 +140,11 @@ mod tests {
                 let (cx, cy) = (covariance * x, covariance * y);
                 let xy = x.dot(cy);
                 let blurred = DMat2::from_cols_array(&[x.dot(cx) + LOW_PASS, xy, xy, y.dot(cy) + LOW_PASS]);
-                (camera.project(point).expect("in front of the camera"), blurred.inverse(), gaussians.opacity(index))
+                (
+                    camera.project(point).expect("in front of the camera"),
+                    blurred.inverse(),
+                    gaussians.opacity(index),
+                )
             })
             .collect();
         let mut blended = 0;
