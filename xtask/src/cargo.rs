@@ -44,7 +44,7 @@ fn announce(arguments: &[&str]) {
 }
 
 /// The cargo that runs this program.
-fn cargo() -> Command {
+pub(crate) fn cargo() -> Command {
     Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
 }
 

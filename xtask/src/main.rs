@@ -1,7 +1,9 @@
-//! Developer commands: `cargo xtask test`, `cargo xtask lint`.
+//! Developer commands: `cargo xtask test`, `cargo xtask lint`, `cargo xtask bench`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
 
+mod bench;
 mod cargo;
+mod instructions;
 mod prerequisites;
 
 use clap::{Parser, Subcommand};
@@ -19,6 +21,9 @@ enum Command {
     Test,
     /// Formatting and lints only.
     Lint,
+    /// Speed of the CPU engine: tables, and instruction counts that noise cannot change.
+    #[command(subcommand)]
+    Bench(bench::Bench),
 }
 
 fn main() -> anyhow::Result<()> {
@@ -29,6 +34,7 @@ fn main() -> anyhow::Result<()> {
             cargo::test()
         }
         Command::Lint => lint(),
+        Command::Bench(bench) => bench.run(),
     }
 }
 

@@ -12,6 +12,7 @@ mod blend;
 pub mod blend_backward;
 mod blocks;
 mod colour;
+mod counts;
 mod depth_order;
 mod engine;
 pub mod footprint_moments;
@@ -24,6 +25,7 @@ mod session;
 #[cfg(test)]
 mod tests;
 
+pub use counts::{PairCounts, pair_counts};
 pub use engine::CpuEngine;
 pub use lanes::{InstructionSet, Instructions, Unavailable};
 pub use pass::Pass;
