@@ -10,6 +10,7 @@
 //! | [`clip`] | a clip on disk: views, frames, masks, data-set layouts |
 //! | [`formats`] | Gaussian files (PLY) and track files (npz) |
 //! | [`raster`] | the CPU engine: project, bin, blend, and their gradients |
+//! | [`simd`] | sixteen numbers at a time, and the choice of instruction set |
 //! | [`loss`], [`optim`], [`metrics`] | L1 + D-SSIM, Adam, PSNR and SSIM |
 //! | [`static_model`] | reconstruction of the key frame |
 //! | [`tracking`] | dense tracks from the key frame to every frame |
@@ -30,6 +31,7 @@ pub mod optim;
 pub mod raster;
 pub mod refine;
 pub mod settings;
+pub mod simd;
 pub mod static_model;
 #[cfg(test)]
 mod testing;

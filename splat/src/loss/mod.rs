@@ -19,7 +19,10 @@ use self::{
     },
     window::{HalfWindow, RADIUS, blur, half_window, horizontal_taps, vertical_taps},
 };
-use crate::image::{Image, Mask};
+use crate::{
+    image::{Image, Mask},
+    simd::Instructions,
+};
 
 /// The loss against one training image; everything that depends on that image alone is computed once.
 #[derive(Clone, Debug)]
@@ -37,6 +40,7 @@ pub struct PhotometricLoss {
 /// Memory that evaluations share, about 90 bytes per pixel.
 #[derive(Clone, Debug, Default)]
 pub struct LossWorkspace {
+    instructions: Instructions,
     size: (usize, usize),
     moments: Vec<f32>,
     derivatives: Vec<f32>,
@@ -48,6 +52,11 @@ pub struct LossWorkspace {
 }
 
 impl LossWorkspace {
+    /// Empty memory; evaluations with it use `instructions`, which does not change what they compute.
+    pub fn new(instructions: Instructions) -> Self {
+        Self { instructions, ..Self::default() }
+    }
+
     /// Resizes for an image. Margins of the scratch rows must be zero, so another size starts from zeros.
     fn fit(&mut self, width: usize, height: usize) {
         if self.size == (width, height) {
@@ -125,6 +134,7 @@ impl PhotometricLoss {
             absolute: (1.0 - self.dssim_weight) / count,
             structural: self.dssim_weight / count,
         };
+        let instructions = workspace.instructions.at_most_avx2();
         let LossWorkspace { moments: moment_records, derivatives: derivative_records, scratch, .. } =
             workspace;
         let band_values = BAND_ROWS * 3 * width;
@@ -135,7 +145,7 @@ impl PhotometricLoss {
             .zip(scratch.par_chunks_mut(scratch_size(width)))
             .enumerate()
             .for_each(|(band, ((records, pixels), scratch))| {
-                moments(inputs, band * BAND_ROWS, pixels, records, scratch);
+                moments(instructions, inputs, band * BAND_ROWS, pixels, records, scratch);
             });
         let moment_records = &*moment_records;
 
@@ -145,7 +155,7 @@ impl PhotometricLoss {
             .zip(scratch.par_chunks_mut(scratch_size(width)))
             .enumerate()
             .for_each(|(band, ((records, sums), scratch))| {
-                derivatives(inputs, band * BAND_ROWS, moment_records, records, sums, scratch);
+                derivatives(instructions, inputs, band * BAND_ROWS, moment_records, records, sums, scratch);
             });
         let derivative_records = &*derivative_records;
 
@@ -156,6 +166,7 @@ impl PhotometricLoss {
             .enumerate()
             .for_each(|(band, ((out, sums), scratch))| {
                 gradient(
+                    instructions,
                     inputs,
                     terms,
                     band * BAND_ROWS,

@@ -2,10 +2,11 @@
 //! evaluate SSIM and blur its derivatives horizontally; finish those vertically and assemble the gradient.
 //!
 //! Every sweep writes rows only, from a fixed partition into bands, and every sum is taken per row: the result does
-//! not depend on the number of threads. There is no fused multiply-add, so that the vector width does not change
-//! the bytes either. Inner loops run over whole rows of one channel and vectorise.
+//! not depend on the number of threads. There is no fused multiply-add, so that the instruction set does not
+//! change the bytes either. Inner loops run over whole rows of one channel and vectorise.
 
 use super::window::{HalfWindow, RADIUS, blur, horizontal_taps, vertical_taps};
+use crate::simd::{Simd, simd_kernel};
 
 /// Stabilisers of SSIM for values in `[0, 1]` (Wang et al. 2004): `(0.01)²` and `(0.03)²`.
 pub(crate) const C1: f64 = 0.01 * 0.01;
@@ -97,42 +98,46 @@ fn row_sum(row: &[f32]) -> f64 {
     sums.iter().chain(rest).map(|&value| f64::from(value)).sum()
 }
 
-/// Compiles a sweep a second time for AVX2 and picks at run time: the same operations in the same order on wider
-/// registers, so the bytes are the same.
-macro_rules! dispatch {
-    ($name:ident => $rows:ident($($argument:ident: $type:ty),* $(,)?)) => {
-        pub(super) fn $name($($argument: $type),*) {
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx2")]
-                fn wide($($argument: $type),*) {
-                    $rows($($argument),*);
-                }
-                if is_x86_feature_detected!("avx2") {
-                    // SAFETY: the processor has the one feature that the function requires.
-                    return unsafe { wide($($argument),*) };
-                }
-            }
-            $rows($($argument),*);
-        }
-    };
+simd_kernel! {
+    /// First sweep over the band of rows from `first_row`; `pixels` are the band's rendered values.
+    pub(super) fn moments(
+        inputs: Inputs<'_>,
+        first_row: usize,
+        pixels: &[f32],
+        records: &mut [f32],
+        scratch: &mut [f32],
+    ) = moments_rows
 }
 
-dispatch!(moments => moments_rows(
-    inputs: Inputs<'_>, first_row: usize, pixels: &[f32], records: &mut [f32], scratch: &mut [f32],
-));
-dispatch!(derivatives => derivatives_rows(
-    inputs: Inputs<'_>, first_row: usize, moments: &[f32], records: &mut [f32], dissimilarity: &mut [f64],
-    scratch: &mut [f32],
-));
-dispatch!(gradient => gradient_rows(
-    inputs: Inputs<'_>, terms: TermWeights, first_row: usize, moments: &[f32], derivatives: &[f32],
-    gradient: &mut [f32], difference: &mut [f64], scratch: &mut [f32],
-));
+simd_kernel! {
+    /// Second sweep: per row the weighted sum of `1 - SSIM`, and the horizontally blurred derivatives of SSIM by the
+    /// windowed mean, square and product.
+    pub(super) fn derivatives(
+        inputs: Inputs<'_>,
+        first_row: usize,
+        moments: &[f32],
+        records: &mut [f32],
+        dissimilarity: &mut [f64],
+        scratch: &mut [f32],
+    ) = derivatives_rows
+}
 
-/// First sweep over the band of rows from `first_row`; `pixels` are the band's rendered values.
+simd_kernel! {
+    /// Third sweep: per row the weighted sum of `|x - y|`, and the gradient, channel fastest.
+    pub(super) fn gradient(
+        inputs: Inputs<'_>,
+        terms: TermWeights,
+        first_row: usize,
+        moments: &[f32],
+        derivatives: &[f32],
+        gradient: &mut [f32],
+        difference: &mut [f64],
+        scratch: &mut [f32],
+    ) = gradient_rows
+}
+
 #[inline(always)]
-pub(super) fn moments_rows(
+fn moments_rows<S: Simd>(
     inputs: Inputs<'_>,
     first_row: usize,
     pixels: &[f32],
@@ -163,10 +168,8 @@ fn multiply(out: &mut [f32], left: &[f32], right: &[f32]) {
     }
 }
 
-/// Second sweep: per row the weighted sum of `1 - SSIM`, and the horizontally blurred derivatives of SSIM by the
-/// windowed mean, square and product.
 #[inline(always)]
-pub(super) fn derivatives_rows(
+fn derivatives_rows<S: Simd>(
     inputs: Inputs<'_>,
     first_row: usize,
     moments: &[f32],
@@ -257,9 +260,8 @@ pub(super) struct TermWeights {
     pub(super) structural: f32,
 }
 
-/// Third sweep: per row the weighted sum of `|x - y|`, and the gradient, channel fastest.
 #[inline(always)]
-pub(super) fn gradient_rows(
+fn gradient_rows<S: Simd>(
     inputs: Inputs<'_>,
     terms: TermWeights,
     first_row: usize,

@@ -210,31 +210,18 @@ fn a_reused_workspace_and_any_thread_count_give_the_same_bytes() {
 }
 
 #[test]
-fn wide_and_portable_code_give_the_same_bytes() {
-    use super::passes::{derivatives_rows, gradient_rows, moments_rows};
-    let (width, height) = (43, BAND_ROWS);
-    let target = random_image(width as u32, height as u32, 19);
+fn every_instruction_set_gives_the_same_bytes() {
+    let (width, height) = (43, 29);
+    let target = random_image(width, height, 19);
     let rendered = disturbed(&target, 0.3, 20);
     let loss = PhotometricLoss::new(&target, None, 0.2);
-    let inputs = Inputs { window: &loss.window, target: &loss.target, zeros: &loss.zeros };
-    let terms = TermWeights { absolute: 0.8, structural: 0.2 };
-    let run = |wide: bool| {
-        let mut workspace = LossWorkspace::default();
-        workspace.fit(width, height);
-        let LossWorkspace { moments: m, derivatives: d, scratch, dissimilarity, difference, .. } =
-            &mut workspace;
-        let mut out = vec![0.0; 3 * width * height];
-        if wide {
-            moments(inputs, 0, &rendered.pixels, m, scratch);
-            derivatives(inputs, 0, m, d, dissimilarity, scratch);
-            gradient(inputs, terms, 0, m, d, &mut out, difference, scratch);
-        } else {
-            moments_rows(inputs, 0, &rendered.pixels, m, scratch);
-            derivatives_rows(inputs, 0, m, d, dissimilarity, scratch);
-            gradient_rows(inputs, terms, 0, m, d, &mut out, difference, scratch);
-        }
-        let sums = dissimilarity.iter().chain(difference.iter()).map(|sum| sum.to_bits());
-        (out.iter().map(|value| value.to_bits()).collect::<Vec<_>>(), sums.collect::<Vec<_>>())
+    let run = |instructions| {
+        let mut out = vec![0.0; rendered.pixels.len()];
+        let value = loss.evaluate(&rendered, &mut LossWorkspace::new(instructions), &mut out);
+        (value.to_bits(), out.iter().map(|value| value.to_bits()).collect::<Vec<_>>())
     };
-    assert_eq!(run(true), run(false));
+    let expected = run(Instructions::detect());
+    for instructions in Instructions::available() {
+        assert_eq!(run(instructions), expected, "{}", instructions.set());
+    }
 }

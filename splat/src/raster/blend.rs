@@ -5,8 +5,8 @@ use super::{
     bin::{BAND_ROWS, Bins},
     blend_backward::Blended,
     blocks::{BLOCK, BlockLists, Entry, corner, fill},
-    lanes::{Instructions, LANES, Simd, simd_kernel},
 };
+use crate::simd::{Instructions, LANES, Simd, simd_kernel};
 
 /// What a band of rows of the image holds while a view is rendered and its gradient is taken.
 #[derive(Clone, Debug, Default)]

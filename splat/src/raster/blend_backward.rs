@@ -17,8 +17,8 @@ use super::{
     ALPHA_MAX, ALPHA_MIN,
     blend::{Band, COLUMNS, Local, Sums},
     blocks::{Entry, corner},
-    lanes::{Group, LANES, ROWS, Simd, simd_kernel},
 };
+use crate::simd::{Group, LANES, ROWS, Simd, simd_kernel};
 
 /// Gradient of the loss by one footprint.
 ///

@@ -5,9 +5,9 @@
 
 use super::{
     bin::{BAND_ROWS, Bins},
-    lanes::{LANES, ROWS, Simd, prefetch, simd_kernel},
     project::Footprint,
 };
+use crate::simd::{LANES, ROWS, Simd, prefetch, simd_kernel};
 
 /// Columns and rows of a block.
 pub(super) const BLOCK: usize = 4;
@@ -271,7 +271,8 @@ impl Reaches {
 mod tests {
     use super::*;
     use crate::{
-        raster::{lanes::Instructions, rows},
+        raster::rows,
+        simd::Instructions,
         testing::{arc, blobs},
     };
 

@@ -9,11 +9,14 @@ use super::{
     bin::{BAND_ROWS, Bins},
     blend::{Band, Local},
     blocks::corner,
-    lanes::{Instructions, LANES, Plain, Simd},
     project::project,
     rows::{rows, span},
 };
-use crate::{cameras::Camera, gaussians::Gaussians};
+use crate::{
+    cameras::Camera,
+    gaussians::Gaussians,
+    simd::{Instructions, LANES, Plain, Simd},
+};
 
 /// Work of one view. A pair is a pixel and a footprint.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

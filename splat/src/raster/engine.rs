@@ -1,12 +1,13 @@
 //! The stages strung together, and the [`Engine`] they make.
 
-use super::{footprint_moments, lanes::Instructions, pass::Pass, session::CpuSession};
+use super::{footprint_moments, pass::Pass, session::CpuSession};
 use crate::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     motion::moments::FootprintMoments,
+    simd::Instructions,
     tracking::TrackField,
 };
 

@@ -9,13 +9,12 @@ use rayon::prelude::*;
 use super::{
     ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
     bin::{BAND_ROWS, Bins},
-    lanes::Instructions,
     project::{Footprint, project},
     rows::{rows, span},
 };
 use crate::{
     cameras::Camera, engine::EngineError, gaussians::Gaussians, motion::moments::FootprintMoments,
-    tracking::TrackField,
+    simd::Instructions, tracking::TrackField,
 };
 
 /// Raw sums of one footprint in one band, positions relative to the projected mean.

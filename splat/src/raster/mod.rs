@@ -16,7 +16,6 @@ mod counts;
 mod depth_order;
 mod engine;
 pub mod footprint_moments;
-mod lanes;
 mod pass;
 pub mod project;
 pub mod project_backward;
@@ -27,7 +26,6 @@ mod tests;
 
 pub use counts::{PairCounts, pair_counts};
 pub use engine::CpuEngine;
-pub use lanes::{InstructionSet, Instructions, Unavailable};
 pub use pass::Pass;
 
 /// Points nearer than this to the principal plane are not drawn, in world units.

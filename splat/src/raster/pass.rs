@@ -6,7 +6,6 @@ use super::{
     bin::{BAND_ROWS, Bins},
     blend::{Band, blend},
     blend_backward::blend_backward,
-    lanes::Instructions,
     project::{CHUNK, View, project},
     project_backward::{GradientChunk, project_backward},
 };
@@ -14,6 +13,7 @@ use crate::{
     cameras::Camera,
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
+    simd::Instructions,
 };
 
 /// The stages of one view and the memory they share, kept between steps so that no step allocates.

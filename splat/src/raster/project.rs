@@ -6,13 +6,12 @@
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::{
-    ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, NEAR_PLANE,
-    bin::BAND_ROWS,
-    colour,
-    lanes::{Instructions, Simd, simd_kernel},
+use super::{ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, NEAR_PLANE, bin::BAND_ROWS, colour};
+use crate::{
+    cameras::Camera,
+    gaussians::Gaussians,
+    simd::{Instructions, Simd, simd_kernel},
 };
-use crate::{cameras::Camera, gaussians::Gaussians};
 
 /// Gaussians per parallel task.
 pub(super) const CHUNK: usize = 512;

@@ -7,10 +7,13 @@ use super::{
     blend::Band,
     blend_backward::FootprintGradient,
     colour,
-    lanes::{Simd, prefetch, simd_kernel},
     project::{Footprint, LocalProjection, View, local_projection},
 };
-use crate::{cameras::Camera, gaussians::Gaussians};
+use crate::{
+    cameras::Camera,
+    gaussians::Gaussians,
+    simd::{Simd, prefetch, simd_kernel},
+};
 
 /// Gaussians whose sums are asked for ahead.
 const AHEAD: usize = 4;

@@ -1,6 +1,6 @@
 //! An optimisation session of the CPU engine: parameters, optimiser state, images and buffers live as long as it does.
 
-use super::{lanes::Instructions, pass::Pass};
+use super::pass::Pass;
 use crate::{
     cameras::Camera,
     engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
@@ -8,6 +8,7 @@ use crate::{
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
     optim::{Adam, LearningRates},
+    simd::Instructions,
 };
 
 struct SessionView {
@@ -57,7 +58,7 @@ impl CpuSession {
             pass: Pass::new(instructions),
             rendered: Image::filled(0, 0, [0.0; 3]),
             image_gradient: Vec::new(),
-            workspace: LossWorkspace::default(),
+            workspace: LossWorkspace::new(instructions),
         })
     }
 

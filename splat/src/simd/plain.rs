@@ -4,7 +4,7 @@ use super::{LANES, ROWS, Simd};
 
 /// Plain arrays, for machines without the instruction sets below and for reference.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Plain([f32; LANES]);
+pub(crate) struct Plain([f32; LANES]);
 
 impl Plain {
     #[inline(always)]

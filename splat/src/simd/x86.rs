@@ -6,11 +6,11 @@ use super::{LANES, ROWS, Simd};
 
 /// One 512-bit register.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx512(__m512);
+pub(crate) struct Avx512(__m512);
 
 /// Two 256-bit registers.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx2(__m256, __m256);
+pub(crate) struct Avx2(__m256, __m256);
 
 /// Wraps intrinsics whose only demand is the instruction set.
 macro_rules! intrinsic {

@@ -24,6 +24,7 @@ impl InstructionSet {
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512bw")
+                && is_x86_feature_detected!("avx2")
                 && is_x86_feature_detected!("fma"),
             is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
         );
@@ -82,6 +83,13 @@ impl Instructions {
     /// All that this machine has, widest first.
     pub fn available() -> impl Iterator<Item = Self> {
         InstructionSet::ALL.into_iter().filter(|set| set.is_available()).map(Self)
+    }
+
+    /// The same, or AVX2 in place of AVX-512: for code that streams through unaligned rows, which gains nothing from wider
+    /// registers.
+    pub(crate) fn at_most_avx2(self) -> Self {
+        // `is_available` asks for AVX2 and FMA with AVX-512.
+        if self.0 == InstructionSet::Avx512 { Self(InstructionSet::Avx2) } else { self }
     }
 
     /// Which it is.

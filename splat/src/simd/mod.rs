@@ -1,4 +1,4 @@
-//! Sixteen pixels at a time, and the choice of instruction set at run time.
+//! Sixteen numbers at a time, and the choice of instruction set at run time.
 //!
 //! Kernels are written once, generic over [`Simd`]. [`simd_kernel!`] compiles such a kernel for AVX-512, for AVX2 + FMA
 //! and for plain arrays, which the compiler turns into the baseline's instructions (SSE2, NEON). AVX-512 and AVX2 give
@@ -13,27 +13,27 @@ mod tests;
 mod x86;
 
 pub use self::instructions::{InstructionSet, Instructions, Unavailable};
-pub(super) use self::plain::Plain;
+pub(crate) use self::plain::Plain;
 #[cfg(target_arch = "x86_64")]
-pub(super) use self::x86::{Avx2, Avx512};
+pub(crate) use self::x86::{Avx2, Avx512};
 
 /// Numbers per group: the pixels of a block, row by row.
-pub(super) const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 
 /// Rows of a group, of as many lanes each.
-pub(super) const ROWS: usize = 4;
+pub(crate) const ROWS: usize = 4;
 
 /// A group in memory, on one cache line.
 #[derive(Clone, Debug, Default)]
 #[repr(C, align(64))]
-pub(super) struct Group(pub [f32; LANES]);
+pub(crate) struct Group(pub [f32; LANES]);
 
 /// A group of [`LANES`] single-precision numbers.
 ///
 /// # Safety
 /// The methods of an implementation may only run inside a function compiled with its instruction set, on a machine
 /// that has it; [`simd_kernel!`] is the only place that chooses one.
-pub(super) trait Simd: Copy {
+pub(crate) trait Simd: Copy {
     /// One flag per lane.
     type Mask: Copy;
     fn splat(value: f32) -> Self;
@@ -90,7 +90,7 @@ pub(super) trait Simd: Copy {
 
 /// Asks for the memory of a value that will be read soon.
 #[inline(always)]
-pub(super) fn prefetch<T>(value: &T) {
+pub(crate) fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
@@ -109,10 +109,10 @@ pub(super) fn prefetch<T>(value: &T) {
 macro_rules! simd_kernel {
     ($(#[$meta:meta])* $vis:vis fn $name:ident($($argument:ident: $type:ty),* $(,)?) = $kernel:ident) => {
         $(#[$meta])*
-        $vis fn $name(instructions: $crate::raster::lanes::Instructions, $($argument: $type),*) {
+        $vis fn $name(instructions: $crate::simd::Instructions, $($argument: $type),*) {
             #[cfg(target_arch = "x86_64")]
             {
-                use $crate::raster::lanes::{Avx2, Avx512, InstructionSet};
+                use $crate::simd::{Avx2, Avx512, InstructionSet};
                 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
                 fn avx512($($argument: $type),*) {
                     $kernel::<Avx512>($($argument),*);
@@ -131,8 +131,8 @@ macro_rules! simd_kernel {
             }
             #[cfg(not(target_arch = "x86_64"))]
             let _ = instructions;
-            $kernel::<$crate::raster::lanes::Plain>($($argument),*);
+            $kernel::<$crate::simd::Plain>($($argument),*);
         }
     };
 }
-pub(super) use simd_kernel;
+pub(crate) use simd_kernel;
