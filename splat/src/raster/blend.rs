@@ -6,7 +6,7 @@ use super::{
     blend_backward::Blended,
     blocks::{BLOCK, BlockLists, Entry, corner, fill},
 };
-use crate::simd::{Instructions, LANES, Simd, simd_kernel};
+use crate::simd::{Instructions, LANES, Simd, prefetch, simd_kernel};
 
 /// What a band of rows of the image holds while a view is rendered and its gradient is taken.
 #[derive(Clone, Debug, Default)]
@@ -66,6 +66,9 @@ impl Band {
 /// Entries whose alphas are computed before the first of them is blended: alphas do not depend on each other, blending
 /// does, and a processor overlaps the long chains of the former only if they stand close together.
 pub(super) const BATCH: usize = 16;
+
+/// Entries whose memory is asked for ahead: a block's list leaves out most of its band, so that no pattern shows.
+pub(super) const AHEAD: usize = 8;
 
 /// Column and row of each lane within a block.
 pub(super) const COLUMNS: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
@@ -153,7 +156,10 @@ fn blend_block<S: Simd>(
     let mut colour = [zero; 3];
     let (mut place, mut last) = (zero, zero);
     let mut alphas = [zero; BATCH];
-    for batch in list.chunks(BATCH) {
+    for (number, batch) in list.chunks(BATCH).enumerate() {
+        for &later in list.iter().skip((number + 1) * BATCH).take(BATCH) {
+            prefetch(&entries[later as usize]);
+        }
         for (alpha, &entry) in alphas.iter_mut().zip(batch) {
             let entry = &entries[entry as usize];
             let value = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));

@@ -15,10 +15,10 @@
 
 use super::{
     ALPHA_MAX, ALPHA_MIN,
-    blend::{Band, COLUMNS, Local, Sums},
+    blend::{AHEAD, Band, COLUMNS, Local, Sums},
     blocks::{Entry, corner},
 };
-use crate::simd::{Group, LANES, ROWS, Simd, simd_kernel};
+use crate::simd::{Group, LANES, ROWS, Simd, prefetch, simd_kernel};
 
 /// Gradient of the loss by one footprint.
 ///
@@ -123,7 +123,10 @@ fn blend_again<S: Simd>(
     let (zero, last) = (S::splat(0.0), S::load(last));
     let mut transmittance = S::splat(1.0);
     let mut place = zero;
-    for (blended, &entry) in blended.iter_mut().zip(list) {
+    for (place_in_list, (blended, &entry)) in blended.iter_mut().zip(list).enumerate() {
+        if let Some(&later) = list.get(place_in_list + AHEAD) {
+            prefetch(&entries[later as usize]);
+        }
         let entry = &entries[entry as usize];
         let alpha = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
         let was_blended = S::both(alpha.ge(S::splat(ALPHA_MIN)), place.lt(last));
@@ -153,7 +156,10 @@ fn replay_block<S: Simd>(
     let nothing = Share { entry: 0, weight: zero, v: zero };
     let mut shares = [nothing; ROWS];
     let mut count = 0;
-    for (blended, &number) in blended.iter().zip(list).rev() {
+    for (place, (blended, &number)) in blended.iter().zip(list).enumerate().rev() {
+        if let Some(&later) = place.checked_sub(AHEAD).and_then(|place| list.get(place)) {
+            prefetch(&sums[later as usize]);
+        }
         let entry = &entries[number as usize];
         let (alpha, weight) = (S::load(&blended.alpha.0), S::load(&blended.weight.0));
         let [red, green, blue] = entry.colour;
