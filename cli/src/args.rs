@@ -3,7 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use splat::settings::{MotionSource, Quality};
+use splat::{
+    raster::CpuEngine,
+    settings::{MotionSource, Quality},
+    simd::{InstructionSet, Instructions},
+};
 use trackersplat_proto::v1::{ExactTracks, SubmitRequest, TrackFiles, submit_request::Tracks};
 
 use crate::{error::CliError, frame_range::FrameRange, layers::SettingsLayers};
@@ -152,6 +156,31 @@ impl JobArgs {
                 Ok(Some(Tracks::TrackFiles(TrackFiles { paths })))
             }
         }
+    }
+}
+
+/// How this machine computes.
+#[derive(Args, Clone, Copy, Debug, Default)]
+pub(crate) struct EngineArgs {
+    /// Instruction set of the processor [default: the widest; possible values: avx512, avx2, baseline].
+    ///
+    /// avx512 and avx2 give the same bytes, baseline others: force it where machines without AVX2 share a job with others.
+    #[arg(long, value_name = "SET", help_heading = "Execution")]
+    pub(crate) instructions: Option<InstructionSet>,
+}
+
+impl EngineArgs {
+    /// The same for another command.
+    pub(crate) fn to_arguments(self) -> Vec<String> {
+        self.instructions.map(|set| format!("--instructions={set}")).into_iter().collect()
+    }
+
+    /// The engine, if this machine can run it.
+    pub(crate) fn engine(self) -> Result<CpuEngine, CliError> {
+        let Some(set) = self.instructions else { return Ok(CpuEngine::default()) };
+        let instructions = Instructions::require(set)
+            .map_err(|error| CliError::bad_input(format!("--instructions {set}"), error))?;
+        Ok(CpuEngine::new(instructions))
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::{net::SocketAddr, path::Path, sync::Arc, time::Duration};
 
-use splat::raster::CpuEngine;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
@@ -10,6 +9,7 @@ use trackersplat_coordinator::{Running, ServeOptions, serve};
 use trackersplat_proto::v1::{JobState, ListRequest, SubmitRequest, jobs_client::JobsClient};
 
 use crate::{
+    args::EngineArgs,
     client, display, environment,
     error::CliError,
     follow::follow,
@@ -31,6 +31,7 @@ pub(crate) struct EmbeddedRun<'a> {
     /// Worker processes to start; 0 waits for workers that are started by hand.
     pub(crate) workers: usize,
     pub(crate) listen: SocketAddr,
+    pub(crate) engine: EngineArgs,
     pub(crate) logs: &'a LogArgs,
 }
 
@@ -80,7 +81,7 @@ impl EmbeddedRun<'_> {
             stores: environment::stores(),
             ..ServeOptions::default()
         };
-        Ok(serve(options, Arc::new(CpuEngine::default()), shutdown.clone()).await?)
+        Ok(serve(options, Arc::new(self.engine.engine()?), shutdown.clone()).await?)
     }
 
     async fn work(
@@ -104,7 +105,7 @@ impl EmbeddedRun<'_> {
             self.output.display()
         );
         let count = if is_done(&mut client, &submitted.job_id).await? { 0 } else { self.workers };
-        let mut workers = WorkerProcesses::start(count, address, state)?;
+        let mut workers = WorkerProcesses::start(count, address, state, self.engine)?;
         let mut display = display::choose(self.logs, address);
         let (notes, mut noted) = mpsc::unbounded_channel();
         let following = follow(&mut client, &submitted.job_id, 0, display.as_mut(), &mut noted, stop);

@@ -3,7 +3,6 @@
 use std::{net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
 
 use clap::Args;
-use splat::raster::CpuEngine;
 use trackersplat_coordinator::{ServeOptions, serve};
 
 use super::cores;
@@ -39,6 +38,9 @@ pub(crate) struct CoordinatorArgs {
     /// Failed attempts that a frame may have.
     #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Leases")]
     max_attempts: u32,
+
+    #[command(flatten)]
+    engine: crate::args::EngineArgs,
 }
 
 pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
@@ -54,7 +56,7 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
         stores: environment::stores(),
         ..ServeOptions::default()
     };
-    let running = serve(options, Arc::new(CpuEngine::default()), interrupted).await?;
+    let running = serve(options, Arc::new(args.engine.engine()?), interrupted).await?;
     // For scripts that let the system choose the port.
     stdout::line(format_args!("http://{}", running.address));
     Ok(running.finished().await?)

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use serde::Serialize;
-use splat::{engine::Engine, raster::CpuEngine};
+use splat::{engine::Engine, raster::CpuEngine, simd::Instructions};
 
 use super::{cores, print_json};
 use crate::{error::CliError, stdout};
@@ -21,7 +21,7 @@ struct Device {
     engine: String,
     name: String,
     threads: usize,
-    features: Vec<&'static str>,
+    features: Vec<String>,
 }
 
 pub(super) fn run(args: DevicesArgs) -> Result<(), CliError> {
@@ -39,27 +39,13 @@ fn cpu() -> Device {
     // Linux only; elsewhere the architecture has to do.
     let processors = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = model_name(&processors).unwrap_or(std::env::consts::ARCH).to_owned();
-    Device { engine: CpuEngine::default().name().to_owned(), name, threads: cores(), features: simd() }
+    let features = Instructions::available().map(|instructions| instructions.set().to_string()).collect();
+    Device { engine: CpuEngine::default().name().to_owned(), name, threads: cores(), features }
 }
 
 fn model_name(processors: &str) -> Option<&str> {
     let line = processors.lines().find(|line| line.starts_with("model name"))?;
     Some(line.split_once(':')?.1.trim())
-}
-
-#[cfg(target_arch = "x86_64")]
-fn simd() -> Vec<&'static str> {
-    let known = [
-        ("avx2", std::arch::is_x86_feature_detected!("avx2")),
-        ("fma", std::arch::is_x86_feature_detected!("fma")),
-        ("avx512f", std::arch::is_x86_feature_detected!("avx512f")),
-    ];
-    known.into_iter().filter(|(_, is_there)| *is_there).map(|(name, _)| name).collect()
-}
-
-#[cfg(not(target_arch = "x86_64"))]
-fn simd() -> Vec<&'static str> {
-    vec![std::env::consts::ARCH]
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use trackersplat_proto::v1::SubmitRequest;
 
 use super::{cores, print_json};
 use crate::{
-    args::JobArgs,
+    args::{EngineArgs, JobArgs},
     embedded::EmbeddedRun,
     error::CliError,
     interrupt,
@@ -45,6 +45,9 @@ pub(crate) struct RunArgs {
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0", help_heading = "Execution")]
     pub(crate) listen: SocketAddr,
 
+    #[command(flatten)]
+    pub(crate) engine: EngineArgs,
+
     /// Print the result as JSON instead of a table.
     #[arg(long, help_heading = "Output")]
     pub(crate) json: bool,
@@ -65,7 +68,7 @@ pub(super) async fn reconstruct(
     logs: &LogArgs,
 ) -> Result<(), CliError> {
     let interrupted = interrupt::token()?;
-    let embedded = EmbeddedRun { output, request, workers, listen: run.listen, logs };
+    let embedded = EmbeddedRun { output, request, workers, listen: run.listen, engine: run.engine, logs };
     let outcome = embedded.run(&interrupted).await.map_err(|error| with_remedy(error, output))?;
     if run.json {
         print_json(&summary(&outcome, output))?;

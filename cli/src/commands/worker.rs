@@ -3,7 +3,6 @@
 use std::{path::PathBuf, sync::Arc, time::Duration};
 
 use clap::Args;
-use splat::raster::CpuEngine;
 use trackersplat_worker::{Exit, WorkerError, WorkerOptions};
 
 use super::{coordinator::seconds, cores};
@@ -34,6 +33,9 @@ pub(crate) struct WorkerArgs {
     /// Never open the store's directory, even if it is there: all bulk goes through the coordinator.
     #[arg(long)]
     remote_blobs: bool,
+
+    #[command(flatten)]
+    engine: crate::args::EngineArgs,
 }
 
 pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
@@ -45,7 +47,7 @@ pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
         reconnect_for: args.reconnect_for,
         remote_blobs: args.remote_blobs,
     };
-    match trackersplat_worker::run(options, Arc::new(CpuEngine::default()), interrupt::token()?).await {
+    match trackersplat_worker::run(options, Arc::new(args.engine.engine()?), interrupt::token()?).await {
         Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
         Err(
             error @ (WorkerError::BadAddress(_)
