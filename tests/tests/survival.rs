@@ -12,6 +12,7 @@ use nix::{
     sys::signal::{Signal, kill},
     unistd::Pid,
 };
+use splat::simd::{InstructionSet, Instructions};
 use tempfile::TempDir;
 use trackersplat_tests::{
     clips,
@@ -107,6 +108,19 @@ fn one_worker_and_two_and_a_second_run_give_the_same_bytes() {
     for workers in [1, 2] {
         let output = tempfile::tempdir().unwrap();
         let (code, log) = program::run(arguments(output.path(), workers));
+        assert_eq!(code, 0, "{log}");
+        assert_undisturbed(output.path());
+    }
+}
+
+#[test]
+fn fused_instruction_sets_give_the_same_bytes_whatever_their_width() {
+    let sets = Instructions::available().map(Instructions::set);
+    for set in sets.filter(|&set| set != InstructionSet::Baseline) {
+        let output = tempfile::tempdir().unwrap();
+        let mut arguments = arguments(output.path(), 2);
+        arguments.push(format!("--instructions={set}"));
+        let (code, log) = program::run(arguments);
         assert_eq!(code, 0, "{log}");
         assert_undisturbed(output.path());
     }
