@@ -72,21 +72,19 @@ impl Pass {
         let (width, height) = (camera.width as usize, camera.height as usize);
         let (bins, instructions) = (&self.bins, self.instructions);
         self.bands.resize_with(bins.bands(), Band::default);
-        let band_pixels = BAND_ROWS * width;
-        let has_alpha = !alpha.is_empty();
-        let mut alphas = alpha.chunks_mut(band_pixels.max(1));
-        let alphas: Vec<&mut [f32]> = (0..bins.bands())
-            .map(|_| if has_alpha { alphas.next().unwrap_or_default() } else { &mut [] })
-            .collect();
-        self.bands
-            .par_iter_mut()
-            .zip(image.pixels.par_chunks_mut(3 * band_pixels.max(1)))
-            .zip(alphas)
-            .enumerate()
-            .for_each(|(number, ((band, pixels), alpha))| {
-                band.reset(instructions, bins, number, width, height, active);
-                blend(instructions, band, background, pixels, alpha);
-            });
+        let band_pixels = (BAND_ROWS * width).max(1);
+        let render = |number: usize, band: &mut Band, pixels: &mut [f32], alpha: &mut [f32]| {
+            band.reset(instructions, bins, number, width, height, active);
+            blend(instructions, band, background, pixels, alpha);
+        };
+        let bands = self.bands.par_iter_mut().zip(image.pixels.par_chunks_mut(3 * band_pixels)).enumerate();
+        if alpha.is_empty() {
+            bands.for_each(|(number, (band, pixels))| render(number, band, pixels, &mut []));
+            return;
+        }
+        bands
+            .zip(alpha.par_chunks_mut(band_pixels))
+            .for_each(|((number, (band, pixels)), alpha)| render(number, band, pixels, alpha));
     }
 
     /// Stage 4: sums over the pixels from the gradient by the image, `H × W × 3`, and by alpha, `H × W` or empty.
