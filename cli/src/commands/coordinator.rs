@@ -35,7 +35,7 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds, help_heading = "Leases")]
     lease_duration: Duration,
 
-    /// Seconds that a lease waits for its worker to come back after the connection broke.
+    /// Seconds that a lease waits for its worker to come back after the connection broke; at most --lease-duration.
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds, help_heading = "Leases")]
     reconnect_grace: Duration,
 
