@@ -108,6 +108,9 @@ mod tests {
         std::fs::create_dir(output.path().join(STATE_FOLDER)).unwrap();
         check(output.path(), &request).unwrap();
         std::fs::write(output.path().join("static.ply"), "").unwrap();
+        check(output.path(), &request).unwrap();
+        std::fs::create_dir(output.path().join("frames")).unwrap();
+        std::fs::write(output.path().join("frames/frame_0001.ply"), "").unwrap();
         check(output.path(), &request).unwrap_err();
     }
 
