@@ -49,7 +49,8 @@ fn owner(output: &Path) -> Option<Owner> {
         return serde_json::from_slice(&bytes).ok();
     }
     let clip = Sequence::read(output).ok()?.clip;
-    Some(Owner { clip: clip.path.display().to_string(), clip_digest: clip.digest })
+    let name = clip.url.unwrap_or_else(|| clip.path.display().to_string());
+    Some(Owner { clip: name, clip_digest: clip.digest })
 }
 
 /// `None` for a URL that needs decoding; the coordinator reads those.
@@ -107,6 +108,9 @@ mod tests {
         std::fs::create_dir(output.path().join(STATE_FOLDER)).unwrap();
         check(output.path(), &request).unwrap();
         std::fs::write(output.path().join("static.ply"), "").unwrap();
+        check(output.path(), &request).unwrap();
+        std::fs::create_dir(output.path().join("frames")).unwrap();
+        std::fs::write(output.path().join("frames/frame_0001.ply"), "").unwrap();
         check(output.path(), &request).unwrap_err();
     }
 

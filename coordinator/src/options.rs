@@ -4,6 +4,9 @@ use std::{net::SocketAddr, path::PathBuf, time::Duration};
 
 use crate::remote_clip::StoreOptions;
 
+/// Longest lease: what comes later than this is no answer to a lost worker, and far from where clocks overflow.
+const LONGEST_LEASE: Duration = Duration::from_secs(24 * 60 * 60);
+
 /// How a coordinator is set up.
 #[derive(Clone, Debug)]
 pub struct ServeOptions {
@@ -60,12 +63,52 @@ impl ServeOptions {
         if self.heartbeat_interval.is_zero() {
             return Some("heartbeat_interval is 0; give at least a few milliseconds".into());
         }
-        if self.lease_duration < 2 * self.heartbeat_interval {
+        if self.lease_duration < self.heartbeat_interval.saturating_mul(2) {
             return Some(format!(
                 "lease_duration {:?} is shorter than two heartbeats of {:?}; give a longer one",
                 self.lease_duration, self.heartbeat_interval
             ));
         }
+        if self.reconnect_grace > self.lease_duration {
+            return Some(format!(
+                "reconnect_grace {:?} is longer than lease_duration {:?}, after which the lease expires in any case; give a \
+                 shorter one, or longer leases",
+                self.reconnect_grace, self.lease_duration
+            ));
+        }
+        if self.lease_duration > LONGEST_LEASE {
+            return Some(format!(
+                "lease_duration {:?} is longer than a day; give a shorter one, or a lost worker's frame is never given out \
+                 again",
+                self.lease_duration
+            ));
+        }
         None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_that_contradict_each_other_are_refused_by_name() {
+        let problem = |adjust: fn(&mut ServeOptions)| {
+            let mut options = ServeOptions::default();
+            adjust(&mut options);
+            options.problem().unwrap_or_default()
+        };
+        assert_eq!(problem(|_| {}), "");
+        assert_eq!(problem(|options| options.reconnect_grace = options.lease_duration), "");
+        for (said, problem) in [
+            ("heartbeat_interval", problem(|options| options.heartbeat_interval = Duration::ZERO)),
+            ("two heartbeats", problem(|options| options.lease_duration = Duration::from_millis(1999))),
+            ("reconnect_grace", problem(|options| options.reconnect_grace = Duration::from_secs(11))),
+            ("reconnect_grace", problem(|options| options.reconnect_grace = Duration::MAX)),
+            ("a day", problem(|options| options.lease_duration = Duration::MAX)),
+            ("lease_duration", problem(|options| options.heartbeat_interval = Duration::MAX)),
+        ] {
+            assert!(problem.contains(said), "no {said:?} in {problem:?}");
+        }
     }
 }

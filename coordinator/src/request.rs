@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use splat::{clip::ClipOptions, settings::Settings};
 
-use crate::keys::digest_of;
+use crate::{keys::digest_of, store::JobRecord};
 
 /// Decoded images that a clip may keep in memory.
 const CLIP_CACHE_BYTES: u64 = 256 << 20;
@@ -56,6 +56,20 @@ pub(crate) struct JobRequest {
     pub(crate) track_files_by_name: bool,
     /// Positions of the training views in the clip.
     pub(crate) training_positions: Vec<usize>,
+    /// Where the clip was copied from; holds no credentials.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) clip_url: Option<String>,
+}
+
+/// A text about a clip that was copied, with its URL in place of the copy's path.
+pub(crate) fn by_url(text: &str, copy: &str, url: Option<&str>) -> String {
+    url.map_or_else(|| text.to_owned(), |url| text.replace(copy, url))
+}
+
+/// The clip of a job as a person knows it: its URL, or its path.
+pub(crate) fn clip_name(job: &JobRecord) -> String {
+    let request: Option<JobRequest> = serde_json::from_str(&job.request).ok();
+    request.and_then(|request| request.clip_url).unwrap_or_else(|| job.clip.clone())
 }
 
 impl JobRequest {
@@ -69,9 +83,9 @@ impl JobRequest {
         }
     }
 
-    /// Digest of everything that, with the clip, decides the results. Files count by content, not by name.
+    /// Digest of everything that, with the clip, decides the results. Files count by content, not by name or place.
     pub(crate) fn settings_digest(&self, settings: &Settings) -> String {
-        let mut request = self.clone();
+        let mut request = Self { clip_url: None, ..self.clone() };
         let nameless = |file: &mut InputFile| file.path.clear();
         request.static_model.iter_mut().for_each(nameless);
         if let TrackSource::Exact(files) = &mut request.tracks {
@@ -105,6 +119,8 @@ mod tests {
         assert_ne!(request.settings_digest(&settings), other.settings_digest(&settings));
         let seeded = Settings { seed: 1, ..settings.clone() };
         assert_ne!(request.settings_digest(&settings), request.settings_digest(&seeded));
+        let copied = JobRequest { clip_url: Some("s3://bucket/clip".into()), ..request.clone() };
+        assert_eq!(request.settings_digest(&settings), copied.settings_digest(&settings));
         let some_frames = JobRequest { frames: Some((1, 2)), ..request.clone() };
         assert_ne!(request.settings_digest(&settings), some_frames.settings_digest(&settings));
 

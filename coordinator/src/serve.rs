@@ -87,6 +87,8 @@ pub struct Running {
     /// Where it listens.
     pub address: SocketAddr,
     task: JoinHandle<Result<(), ServeError>>,
+    #[cfg(test)]
+    pub(crate) hub: std::sync::Weak<Hub>,
 }
 
 impl Running {
@@ -129,8 +131,15 @@ pub async fn serve(
     let hub = Arc::new(Hub::new(options, store, blobs, probe, compute, engine, shutdown));
     hub.recover().await?;
     tracing::info!(%address, root = %hub.options.root.display(), "coordinator serves");
+    #[cfg(test)]
+    let weak = Arc::downgrade(&hub);
     let task = tokio::spawn(run(hub, listener, lock));
-    Ok(Running { address, task })
+    Ok(Running {
+        address,
+        task,
+        #[cfg(test)]
+        hub: weak,
+    })
 }
 
 /// Two coordinators on one state would void each other's leases. The lock ends with the process at the latest.

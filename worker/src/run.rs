@@ -117,11 +117,12 @@ pub enum WorkerError {
 /// Works for a coordinator until it is dismissed, shut down, or given up on.
 ///
 /// A broken stream is opened again for up to [`WorkerOptions::reconnect_for`]; the running frame goes on meanwhile.
-/// Whether its result counts is the coordinator's to say. It voids a lease as soon as it sees the stream break or the
-/// worker register again, and when it restarts: it then cancels the frame at the next heartbeat, or answers the report
-/// with a receipt that is not accepted, and gives the frame out again. Only a report that was accepted before, and
-/// comes again because its receipt was lost, is acknowledged over the new stream. Either way the worker asks for the
-/// next frame. Needs a tokio runtime with timers and I/O.
+/// The new stream names the lease that the worker still works on, or whose report has no receipt yet, and the lease goes
+/// on over it if the worker is back in time. Whether its result counts is the coordinator's to say: a lease that has
+/// expired, or of before the coordinator was restarted, is cancelled at the next heartbeat, or its report is answered
+/// with a receipt that is not accepted. A report that was accepted before, and comes again because its receipt was lost,
+/// is accepted again; one that is being verified gets no receipt yet, so it is sent until it gets one. Then the worker
+/// asks for the next frame. Needs a tokio runtime with timers and I/O.
 pub async fn run(
     options: WorkerOptions,
     engine: Arc<dyn Engine>,

@@ -138,6 +138,7 @@ async fn a_report_is_repeated_until_it_is_acknowledged() {
     // Over a new stream too: the coordinator may have died before it wrote the result down.
     drop(session);
     let mut session = coordinator.welcome().await;
+    assert_eq!(session.register.held_lease_id, "lease-1", "its lease goes on until there is a receipt");
     assert_eq!(session.wait_for_report().await, first);
     session.acknowledge(&first).await;
     session.wait_for_lease_request().await;

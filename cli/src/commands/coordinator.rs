@@ -8,6 +8,9 @@ use trackersplat_coordinator::{ServeOptions, serve};
 use super::cores;
 use crate::{environment, error::CliError, interrupt, stdout};
 
+/// Longest duration that may be given.
+const LONGEST_SECONDS: f64 = 86_400.0;
+
 /// Arguments of `coordinator`.
 #[derive(Args, Debug)]
 pub(crate) struct CoordinatorArgs {
@@ -31,7 +34,7 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds, help_heading = "Leases")]
     lease_duration: Duration,
 
-    /// Seconds that a lease waits for its worker to come back after the connection broke.
+    /// Seconds that a lease waits for its worker to come back after the connection broke; at most --lease-duration.
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds, help_heading = "Leases")]
     reconnect_grace: Duration,
 
@@ -62,9 +65,12 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
     Ok(running.finished().await?)
 }
 
-/// A number of seconds, with fractions.
+/// A number of seconds, with fractions, of a day at most: what is added to a clock must not overflow it.
 pub(super) fn seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text.parse().map_err(|_| format!("'{text}' is no number of seconds"))?;
+    if seconds > LONGEST_SECONDS {
+        return Err(format!("'{text}' seconds are longer than a day; give {LONGEST_SECONDS} at most"));
+    }
     Duration::try_from_secs_f64(seconds).map_err(|error| format!("'{text}' seconds: {error}"))
 }
 
@@ -75,7 +81,8 @@ mod tests {
     #[test]
     fn seconds_have_fractions_and_are_not_negative() {
         assert_eq!(seconds("0.5"), Ok(Duration::from_millis(500)));
-        for wrong in ["", "x", "-1", "NaN", "inf", "1e300"] {
+        assert_eq!(seconds("86400"), Ok(Duration::from_secs(86_400)));
+        for wrong in ["", "x", "-1", "NaN", "inf", "1e300", "1e19", "86401"] {
             assert!(seconds(wrong).is_err(), "{wrong}");
         }
     }

@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use super::{AssemblyError, CONTACT_SHEET, METRICS, SEQUENCE, STATIC_MODEL};
+use super::AssemblyError;
 
 /// `frames/frame_0001.ply`, relative to the output folder.
 pub fn frame_path(number: u32) -> PathBuf {
@@ -18,12 +18,20 @@ pub fn delta_path(number: u32) -> PathBuf {
     Path::new("deltas").join(format!("frame_{number:04}.delta"))
 }
 
-/// Whether an output folder holds anything that a job computed.
+/// Whether an output folder holds a finished frame; a folder that cannot be read may.
 pub fn holds_results(output: &Path) -> bool {
-    let files = [STATIC_MODEL, SEQUENCE, METRICS, CONTACT_SHEET].map(|name| output.join(name));
+    let is_finished = |file: io::Result<fs::DirEntry>| file.map_or(true, |file| !is_temporary(&file.path()));
+    let holds_finished = |folder: PathBuf| match fs::read_dir(folder) {
+        Ok(mut files) => files.any(is_finished),
+        Err(error) => error.kind() != io::ErrorKind::NotFound,
+    };
     let folders = [frame_path(1), delta_path(1)];
-    let folders = folders.iter().filter_map(|file| file.parent()).map(|folder| output.join(folder));
-    files.into_iter().chain(folders).any(|path| path.exists())
+    folders.iter().filter_map(|file| file.parent()).any(|folder| holds_finished(output.join(folder)))
+}
+
+/// Whether a file was being written when its writer ended.
+fn is_temporary(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "partial")
 }
 
 /// Writes a file under a temporary name, then renames it; makes its folder if needed.
@@ -62,11 +70,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
         assert!(!holds_results(folder.path()) && !holds_results(&folder.path().join("none")));
-        write_atomically(&folder.path().join(frame_path(7)), b"x").unwrap();
-        assert!(holds_results(folder.path()));
-        fs::remove_dir_all(folder.path().join("frames")).unwrap();
-        write_atomically(&folder.path().join(SEQUENCE), b"{}").unwrap();
-        assert!(holds_results(folder.path()));
+        // What a job whose frames have all failed leaves behind.
+        write_atomically(&folder.path().join(crate::assembly::STATIC_MODEL), b"x").unwrap();
+        write_atomically(&folder.path().join(crate::assembly::SEQUENCE), b"{}").unwrap();
+        fs::create_dir(folder.path().join("frames")).unwrap();
+        fs::write(folder.path().join("frames/frame_0007.ply.partial"), b"x").unwrap();
+        assert!(!holds_results(folder.path()));
+        for file in [frame_path(7), delta_path(7)] {
+            write_atomically(&folder.path().join(&file), b"x").unwrap();
+            assert!(holds_results(folder.path()));
+            fs::remove_file(folder.path().join(file)).unwrap();
+        }
+        assert!(!holds_results(folder.path()));
     }
 
     #[test]

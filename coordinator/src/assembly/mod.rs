@@ -112,10 +112,8 @@ pub struct AssemblyInput<'a> {
     pub output: PathBuf,
     /// The job.
     pub job_id: String,
-    /// Path of the clip.
-    pub clip_path: PathBuf,
-    /// Digest of its content.
-    pub clip_digest: String,
+    /// The clip.
+    pub clip: sequence::SequenceClip,
     /// Settings of the job.
     pub settings: &'a Settings,
     /// Gaussian PLY of the key frame.

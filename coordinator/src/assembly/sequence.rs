@@ -41,6 +41,9 @@ pub struct Sequence {
 pub struct SequenceClip {
     /// Its folder, as the coordinator saw it.
     pub path: PathBuf,
+    /// The object store that the folder was copied from; holds no credentials.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub url: Option<String>,
     /// BLAKE3 of its content, hexadecimal.
     pub digest: String,
 }
@@ -149,7 +152,7 @@ impl Sequence {
             schema_version: SCHEMA_VERSION,
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
             job_id: input.job_id.clone(),
-            clip: SequenceClip { path: input.clip_path.clone(), digest: input.clip_digest.clone() },
+            clip: input.clip.clone(),
             settings: input.settings.clone(),
             static_model: SequenceStaticModel {
                 file: SequenceFile { path: super::STATIC_MODEL.into(), bytes: input.static_ply.len() as u64 },

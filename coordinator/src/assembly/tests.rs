@@ -106,8 +106,7 @@ fn input<'a>(output: &Path, settings: &'a Settings, frames: Vec<AssembledFrame>)
     AssemblyInput {
         output: output.to_owned(),
         job_id: "job-1".into(),
-        clip_path: "clips/slide".into(),
-        clip_digest: digest(),
+        clip: sequence::SequenceClip { path: "clips/slide".into(), url: None, digest: digest() },
         settings,
         static_ply: ply::write_ply(&gaussians(0.25)).into(),
         static_report: serde_json::json!({ "steps": 10 }),

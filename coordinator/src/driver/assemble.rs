@@ -7,7 +7,9 @@ use trackersplat_proto::v1::{Blob, FailureKind};
 
 use super::Job;
 use crate::{
-    assembly::{self, AssembledFrame, AssembledView, AssemblyInput, delta_path, frame_path},
+    assembly::{
+        self, AssembledFrame, AssembledView, AssemblyInput, delta_path, frame_path, sequence::SequenceClip,
+    },
     failure::StageError,
     hub::{FrameBase, Hub},
     queue::frame::FrameState,
@@ -33,8 +35,12 @@ impl Job {
         let records = self.hub.store.frames(&self.id).await?;
         let parts = self.parts(&records).await?;
         let (hub, settings) = (self.hub.clone(), self.settings.clone());
-        let (job_id, clip_path) = (self.id.to_string(), PathBuf::from(&self.record.clip));
-        let clip_digest = self.record.clip_digest.clone();
+        let job_id = self.id.to_string();
+        let clip = SequenceClip {
+            path: PathBuf::from(&self.record.clip),
+            url: self.request.clip_url.clone(),
+            digest: self.record.clip_digest.clone(),
+        };
         let runtime = tokio::runtime::Handle::current();
         let write = move || {
             let test_image =
@@ -43,8 +49,7 @@ impl Job {
             let input = AssemblyInput {
                 output: parts.base.output.clone(),
                 job_id,
-                clip_path,
-                clip_digest,
+                clip,
                 settings: &settings,
                 static_ply: parts.static_ply,
                 static_report: parts.static_report,

@@ -25,7 +25,7 @@ use crate::{
     failure::{StageError, failure},
     hub::Hub,
     queue::{JobId, job::JobState},
-    request::JobRequest,
+    request::{JobRequest, by_url},
     store::{JobRecord, StoreError, ViewRecord},
 };
 
@@ -63,7 +63,10 @@ async fn run_stages(
     clip: Option<Arc<Clip>>,
 ) -> Result<(), StoreError> {
     let ended = match Job::load(hub.clone(), id.clone(), stop.clone(), frame_ended, clip).await {
-        Ok(mut job) => job.run_to_end().await,
+        Ok(mut job) => {
+            let ended = job.run_to_end().await;
+            ended.map_err(|error| job.named_by_url(error))
+        }
         Err(error) => Err(error),
     };
     match ended {
@@ -109,6 +112,18 @@ impl Job {
             state = self.hub.advance(&self.id, &self.stop, state).await?;
         }
         Ok(())
+    }
+
+    /// A failure names a copied clip by its URL.
+    fn named_by_url(&self, error: StageError) -> StageError {
+        match error {
+            StageError::Failed(mut failure) => {
+                failure.message =
+                    by_url(&failure.message, &self.record.clip, self.request.clip_url.as_deref());
+                StageError::Failed(failure)
+            }
+            error => error,
+        }
     }
 
     async fn run_stage(&mut self, state: JobState) -> Result<(), StageError> {

@@ -1,6 +1,9 @@
 //! Jobs begin, change state, and end.
 
-use std::{path::PathBuf, sync::Arc};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
 use splat::clip::Clip;
 use tokio::sync::Notify;
@@ -178,6 +181,25 @@ impl Hub {
             }
         }
         Ok(outputs)
+    }
+
+    /// A job that has not ended and reads the clip in this folder.
+    pub(crate) async fn clip_user(&self, folder: &Path) -> Result<Option<String>, StoreError> {
+        let opened = |job: &ActiveJob| job.clip.as_ref().is_some_and(|clip| clip.root() == folder);
+        let user = {
+            let desk = self.desk.lock().await;
+            desk.active.iter().find(|(_, job)| opened(job)).map(|(id, _)| id.to_string())
+        };
+        if user.is_some() {
+            return Ok(user);
+        }
+        // After a restart, a job opens the clip again by the path that it was submitted with.
+        for job in self.store.jobs().await? {
+            if !job.state()?.has_ended() && Path::new(&job.clip) == folder {
+                return Ok(Some(job.id));
+            }
+        }
+        Ok(None)
     }
 
     /// Whether a job lets another one have its output folder: it is one of this coordinator's, has no finished frame,

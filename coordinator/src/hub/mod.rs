@@ -90,8 +90,8 @@ pub(crate) struct Hub {
     pub(crate) turn: Semaphore,
     /// One submission at a time, so that the same one twice is one job.
     pub(crate) submitting: tokio::sync::Mutex<()>,
-    /// One submission from an object store at a time, so that no copy changes while another reads it.
-    pub(crate) copying: Arc<tokio::sync::Mutex<()>>,
+    /// One submission of a URL at a time, by the URL's digest, so that no copy changes while another reads it.
+    copying: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
     pub(crate) probe: Blob,
     desk: tokio::sync::Mutex<Desk>,
     notices: broadcast::Sender<Notice>,
@@ -130,7 +130,7 @@ impl Hub {
             shutdown,
             turn: Semaphore::new(1),
             submitting: tokio::sync::Mutex::new(()),
-            copying: Arc::default(),
+            copying: Mutex::default(),
             probe,
             desk: tokio::sync::Mutex::new(desk),
             notices: broadcast::Sender::new(NOTICES),
@@ -157,6 +157,13 @@ impl Hub {
     /// Folder of clips that were copied from object stores.
     pub(crate) fn clip_folder(&self) -> PathBuf {
         self.options.root.join("clips")
+    }
+
+    /// Who holds this lock may change the copy of the clip whose URL has this digest.
+    pub(crate) fn copying(&self, url_digest: &str) -> Arc<tokio::sync::Mutex<()>> {
+        let mut copying = self.copying.lock().unwrap_or_else(PoisonError::into_inner);
+        copying.retain(|_, lock| Arc::strong_count(lock) > 1);
+        copying.entry(url_digest.to_owned()).or_default().clone()
     }
 
     /// Paths under the root that are no job's output.

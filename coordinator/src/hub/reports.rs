@@ -6,6 +6,7 @@ use splat::{
     frame::FrameReport,
     gaussians::{delta, validate},
 };
+use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{
     Blob, Failure, FailureKind, Report, ReportReceipt, Success, coordinator_message::Message, report::Outcome,
 };
@@ -39,15 +40,29 @@ impl From<FrameError> for StageError {
 }
 
 impl Hub {
-    /// A worker reports; it gets a receipt in any case.
+    /// A worker reports. It gets a receipt unless an earlier report of the lease is still being verified: the worker
+    /// then sends it again, and is answered by what became of the earlier one.
     pub(crate) async fn report(&self, session: SessionId, report: Report) -> Result<(), StoreError> {
         let Report { lease_id, attempt, outcome } = report;
-        let refusal = match outcome {
-            Some(Outcome::Success(success)) => self.succeeded(session, &lease_id, attempt, success).await?,
-            Some(Outcome::Failure(reason)) => self.gave_up(session, &lease_id, attempt, reason).await?,
-            None => {
-                let reason = failure(FailureKind::Bug, "the worker's report has no outcome");
-                self.gave_up(session, &lease_id, attempt, reason).await?
+        let held = {
+            let mut desk = self.desk.lock().await;
+            let begun = desk.queue.begin_report(session, &lease_id, attempt);
+            let begun = begun.map(Option::<&Lease>::cloned);
+            begun.map(|lease| lease.map(|lease| (desk.base(&lease.key.job), lease)))
+        };
+        let refusal = match (held, outcome) {
+            (Ok(None), _) => {
+                tracing::info!(lease_id, attempt, "reported again while the result is verified");
+                return Ok(());
+            }
+            (Ok(Some((run, lease))), Some(Outcome::Success(success))) => {
+                self.succeeded(&lease, run, success).await?
+            }
+            (Ok(Some(_)), outcome) => self.failed(&lease_id, attempt, reason_of(outcome)).await?,
+            (Err(stale), Some(Outcome::Success(_))) => self.stale_success(&lease_id, attempt, &stale).await?,
+            (Err(stale), _) => {
+                tracing::warn!(lease_id, attempt, %stale, "stale failure refused");
+                Some(stale.to_string())
             }
         };
         let mut desk = self.desk.lock().await;
@@ -57,23 +72,14 @@ impl Hub {
         self.dispatch(&mut desk).await
     }
 
-    /// The worker reports a failure. `None` if it counts, else why not.
-    async fn gave_up(
-        &self,
-        session: SessionId,
-        lease_id: &str,
-        attempt: u32,
-        reason: Failure,
-    ) -> Result<Option<String>, StoreError> {
-        let held = self.desk.lock().await.queue.begin_report(session, lease_id, attempt).map(drop);
-        let refusal = match held {
-            Ok(()) => self.failed(lease_id, attempt, reason).await?,
-            Err(stale) => Some(stale.to_string()),
-        };
-        if let Some(stale) = &refusal {
-            tracing::warn!(lease_id, attempt, stale, "stale failure refused");
-        }
-        Ok(refusal)
+    /// The verification of this stream's report ended in a panic: the attempt has failed.
+    pub(crate) async fn report_panicked(&self, session: SessionId) -> Result<(), StoreError> {
+        let mut desk = self.desk.lock().await;
+        let Some(failed) = desk.queue.abandon_report(session) else { return Ok(()) };
+        let reason =
+            failure(FailureKind::Bug, "the coordinator panicked over the worker's report; its log says why");
+        self.record_failed(&mut desk, &failed, &reason).await?;
+        self.dispatch(&mut desk).await
     }
 
     /// A reported attempt has failed. `None`, or why the lease ended meanwhile.
@@ -102,33 +108,24 @@ impl Hub {
         Ok(Some(stale.unwrap_or(message)))
     }
 
-    /// `None` if the result counts, else why not.
+    /// `None` if the result counts, else why not. `run` is what it is verified against, and ends with the job's run.
     async fn succeeded(
         &self,
-        session: SessionId,
-        lease_id: &str,
-        attempt: u32,
+        lease: &Lease,
+        run: Option<(Arc<FrameBase>, CancellationToken)>,
         success: Success,
     ) -> Result<Option<String>, StoreError> {
-        let held = {
-            let mut desk = self.desk.lock().await;
-            let lease = desk.queue.begin_report(session, lease_id, attempt).cloned();
-            lease.map(|lease| (desk.base(&lease.key.job), lease))
-        };
-        let (run, lease) = match held {
-            Ok(held) => held,
-            Err(stale) => return self.stale_success(lease_id, attempt, &stale).await,
-        };
+        let (lease_id, attempt) = (lease.id.as_str(), lease.attempt);
         let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
         let Some((base, stop)) = run else {
             let reason = failure(FailureKind::Transient, "the job is not ready for results");
             return self.refused(lease_id, attempt, reason).await;
         };
-        let delta = match self.verify(&lease, base, &success).await {
+        let delta = match self.verify(lease, base, &success).await {
             Ok(delta) => delta,
             Err(FrameError::Output(reason)) => {
                 let message = reason.message.clone();
-                self.keep_result(&lease, &success).await?;
+                self.keep_result(lease, &success).await?;
                 self.fail_run(&lease.key.job, &stop, reason).await?;
                 return Ok(Some(message));
             }
@@ -237,6 +234,14 @@ impl Hub {
             let message = format!("reading the delta of frame {frame}: {error}");
             Err(FrameError::Result(failure(FailureKind::Bug, message)))
         })
+    }
+}
+
+/// Why the worker gave the frame up.
+fn reason_of(outcome: Option<Outcome>) -> Failure {
+    match outcome {
+        Some(Outcome::Failure(reason)) => reason,
+        _ => failure(FailureKind::Bug, "the worker's report has no outcome"),
     }
 }
 

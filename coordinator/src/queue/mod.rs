@@ -57,8 +57,8 @@ pub struct Lease {
     pub since: Instant,
     /// When it expires without a heartbeat.
     pub deadline: Instant,
-    /// Whether its result is being verified; it does not expire meanwhile.
-    reporting: bool,
+    /// The stream whose report is being verified; it does not expire meanwhile.
+    reporting: Option<SessionId>,
 }
 
 /// A lease that ended in failure, and what follows.
@@ -185,7 +185,7 @@ impl Queue {
                 lease.session = session;
                 lease.deadline = now + self.policy.lease_duration;
                 entry.lease = Some(lease.id.clone());
-            } else if !lease.reporting {
+            } else if lease.reporting.is_none() {
                 lost.push(lease.id.clone());
             }
         }
@@ -202,9 +202,13 @@ impl Queue {
         }
     }
 
-    /// A worker drains: it gets nothing more, and its lease is void without counting as a failed attempt.
+    /// A worker drains: it gets nothing more, and its lease is void without counting as a failed attempt. A lease whose
+    /// result is being verified goes on to its end.
     pub fn drain(&mut self, session: SessionId) -> Option<Lease> {
         let lease_id = self.sessions.remove(&session)?.lease?;
+        if self.leases.get(&lease_id)?.reporting.is_some() {
+            return None;
+        }
         let lease = self.end(&lease_id)?;
         self.reopen(&lease.key);
         Some(lease)
@@ -259,7 +263,7 @@ impl Queue {
             session: session_id,
             since: now,
             deadline: now + self.policy.lease_duration,
-            reporting: false,
+            reporting: None,
         };
         let session = self.sessions.get_mut(&session_id)?;
         session.ticket = None;
@@ -292,16 +296,26 @@ impl Queue {
         Ok(lease)
     }
 
-    /// A report has arrived: the lease does not expire while it is verified, whatever becomes of the stream.
+    /// A report has arrived: the lease does not expire while it is verified, whatever becomes of the stream. `None` if
+    /// an earlier report of it is being verified: this one is to be left alone.
     pub fn begin_report(
         &mut self,
         session: SessionId,
         lease_id: &str,
         attempt: u32,
-    ) -> Result<&Lease, Stale> {
+    ) -> Result<Option<&Lease>, Stale> {
         let lease = self.held(session, lease_id, attempt)?;
-        lease.reporting = true;
-        Ok(lease)
+        if lease.reporting.is_some() {
+            return Ok(None);
+        }
+        lease.reporting = Some(session);
+        Ok(Some(lease))
+    }
+
+    /// Nobody verifies the report of this stream any more: the attempt has failed, whoever holds the lease by now.
+    pub fn abandon_report(&mut self, session: SessionId) -> Option<FailedLease> {
+        let abandoned = self.leases.values().find(|lease| lease.reporting == Some(session))?.id.clone();
+        self.end_failed(&abandoned, FailureKind::Bug)
     }
 
     /// The verified result counts: the frame is closed.
@@ -320,7 +334,7 @@ impl Queue {
 
     /// Leases without a sign of life have failed as lost.
     pub fn expire(&mut self, now: Instant) -> Vec<FailedLease> {
-        let silent = self.leases.values().filter(|lease| !lease.reporting && lease.deadline <= now);
+        let silent = self.leases.values().filter(|lease| lease.reporting.is_none() && lease.deadline <= now);
         let silent: Vec<String> = silent.map(|lease| lease.id.clone()).collect();
         silent.iter().filter_map(|id| self.end_failed(id, FailureKind::LostWorker)).collect()
     }
@@ -346,9 +360,11 @@ impl Queue {
         ready.filter(|(_, frame)| !self.is_servable(frame)).count()
     }
 
-    /// Ready frames for which every connected worker, and there is at least one, lacks the resources.
+    /// Ready frames for which every connected worker, and there is at least one, lacks the resources. None while a
+    /// worker may come back to its lease: it may be the one that has them.
     pub fn frames_beyond_all_workers(&self) -> Vec<FrameKey> {
-        if self.sessions.is_empty() {
+        let is_held = |lease: &Lease| self.sessions.contains_key(&lease.session);
+        if self.sessions.is_empty() || !self.leases.values().all(is_held) {
             return Vec::new();
         }
         let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());

@@ -282,6 +282,67 @@ fn a_result_that_is_verified_counts_though_its_stream_broke() {
 }
 
 #[test]
+fn a_report_that_comes_again_while_it_is_verified_is_left_alone() {
+    let mut bench = Bench::new([1]);
+    let broken = SessionId(1);
+    bench.queue.connect(broken, &register("w", "process", ""), bench.now);
+    bench.queue.park(broken);
+    let lease = bench.assign_one();
+    assert!(bench.queue.begin_report(broken, &lease.id, 1).expect("held").is_some());
+    assert_eq!(bench.queue.begin_report(broken, &lease.id, 1), Ok(None));
+    bench.queue.disconnect(broken, bench.now);
+    let back = SessionId(2);
+    bench.queue.connect(back, &register("w", "process", &lease.id), bench.now);
+    assert_eq!(bench.queue.begin_report(back, &lease.id, 1), Ok(None), "over a new stream too");
+    let repeated = Stale::OtherAttempt { lease_id: lease.id.clone(), held: 1, given: 2 };
+    assert_eq!(bench.queue.begin_report(back, &lease.id, 2), Err(repeated));
+    assert!(bench.queue.commit(&lease.id, 1).is_ok());
+}
+
+#[test]
+fn a_worker_that_drains_while_its_result_is_verified_keeps_it() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    bench.queue.begin_report(session, &lease.id, 1).expect("held");
+    assert_eq!(bench.queue.drain(session), None);
+    bench.connect(2, "v");
+    assert_eq!(bench.assign(), [], "the frame is not given out beside its verification");
+    assert!(bench.queue.commit(&lease.id, 1).is_ok());
+}
+
+#[test]
+fn a_report_that_nobody_verifies_any_more_is_a_failed_attempt() {
+    let mut bench = Bench::new([1]);
+    let broken = SessionId(1);
+    bench.queue.connect(broken, &register("w", "process", ""), bench.now);
+    bench.queue.park(broken);
+    let lease = bench.assign_one();
+    assert_eq!(bench.queue.abandon_report(broken), None, "a lease without a report goes on");
+    bench.queue.begin_report(broken, &lease.id, 1).expect("held");
+    let back = SessionId(2);
+    bench.queue.connect(back, &register("w", "process", &lease.id), bench.now);
+    let failed = bench.queue.abandon_report(broken).expect("its report was being verified");
+    assert!(failed.retried && failed.lease.id == lease.id);
+    bench.queue.park(back);
+    assert_eq!(bench.assign_one().attempt, 2);
+}
+
+#[test]
+fn no_frame_is_beyond_all_workers_while_one_may_come_back() {
+    let mut bench = Bench::new([1, 2]);
+    bench.connect(1, "small");
+    let lease = bench.assign_one();
+    let large = bench.connect(2, "large");
+    bench.assign_one();
+    bench.fail(&lease, FailureKind::OutOfResources);
+    bench.queue.disconnect(large, bench.now);
+    assert_eq!(bench.queue.frames_beyond_all_workers(), []);
+    bench.queue.expire(bench.now + GRACE);
+    assert_eq!(bench.queue.frames_beyond_all_workers(), [key(1)]);
+}
+
+#[test]
 fn attempts_go_on_from_the_history() {
     let mut bench = Bench::new([]);
     let excluded = BTreeSet::from(["small".to_owned()]);

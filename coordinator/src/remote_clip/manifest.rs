@@ -35,15 +35,8 @@ pub(super) struct Manifest {
 impl Manifest {
     /// Opens the manifest, forgets the names that are not `wanted`, and writes it anew without them.
     pub(super) fn open(path: &Path, wanted: impl Fn(&Path) -> bool) -> io::Result<Self> {
-        let text = match std::fs::read(path) {
-            Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => String::new(),
-            Err(error) => return Err(error),
-        };
-        // A line that a killed coordinator wrote by half is none: its object is copied again.
-        let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
-        let versions: BTreeMap<PathBuf, Version> =
-            lines.filter(|line| wanted(&line.name)).map(|line| (line.name, line.version)).collect();
+        let mut versions = read(path)?;
+        versions.retain(|name, _| wanted(name));
         let temporary = path.with_extension("partial");
         let mut file = File::create(&temporary)?;
         for (name, version) in &versions {
@@ -63,6 +56,18 @@ impl Manifest {
     pub(super) fn record(&mut self, name: &Path, version: &Version) -> io::Result<()> {
         write_line(&mut self.file, name, version)
     }
+}
+
+/// The objects that were copied; none if there is no manifest.
+pub(super) fn read(path: &Path) -> io::Result<BTreeMap<PathBuf, Version>> {
+    let text = match std::fs::read(path) {
+        Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => String::new(),
+        Err(error) => return Err(error),
+    };
+    // A line that a killed coordinator wrote by half is none: its object is copied again.
+    let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
+    Ok(lines.map(|line| (line.name, line.version)).collect())
 }
 
 /// In one write, so that lines are not torn but by a crash.

@@ -7,8 +7,12 @@
 //! ```
 
 mod address;
+mod error;
 mod manifest;
+mod object;
 mod stores;
+#[cfg(test)]
+mod tests;
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -17,11 +21,10 @@ use std::{
 };
 
 use futures::{StreamExt, TryStreamExt, stream};
-use object_store::{ObjectMeta, ObjectStore, ObjectStoreExt};
-use thiserror::Error;
-use tokio::io::AsyncWriteExt;
+use object_store::ObjectStore;
 
 pub(crate) use self::address::{ClipUrl, is_remote, without_secrets};
+pub(crate) use self::error::RemoteClipError;
 use self::manifest::{Manifest, Version};
 pub use self::stores::StoreOptions;
 
@@ -29,40 +32,14 @@ pub use self::stores::StoreOptions;
 const CONCURRENT: usize = 8;
 /// Log lines that a copy says how far it is by.
 const REPORTS: u64 = 20;
+/// More than any clip has: the listing of a whole bucket ends here, before it fills memory or disk.
+const LIMITS: Limits = Limits { objects: 500_000, bytes: 4 << 40 };
 
-/// Why a clip could not be copied from an object store. Holds no credentials.
-#[derive(Debug, Error)]
-pub(crate) enum RemoteClipError {
-    /// The URL cannot be used.
-    #[error("clip '{url}' {reason}; {remedy}")]
-    Address { url: String, reason: String, remedy: &'static str },
-    /// The store refuses, or cannot be reached.
-    #[error("clip {url}: {cause}; {remedy}")]
-    Store {
-        url: String,
-        cause: String,
-        remedy: &'static str,
-        /// Whether the same submission may succeed later.
-        may_pass: bool,
-    },
-    /// There is nothing.
-    #[error(
-        "clip {url}: there is no object under this prefix; check bucket and prefix, which is the folder that holds the \
-         clip's files"
-    )]
-    Empty { url: String },
-    /// A file of the copy cannot have the object's name.
-    #[error("clip {url}: the object {name:?} {reason}; rename or remove it")]
-    Name { url: String, name: String, reason: &'static str },
-    /// The object is not what the store had listed.
-    #[error("clip {url}: the object {name:?} {reason}; submit again when nobody writes to the clip")]
-    Changed { url: String, name: String, reason: String },
-    /// The copy cannot be written.
-    #[error(
-        "clip {url}: cannot write its copy {path}: {source}; make room on the disk of the coordinator's folder, then \
-         submit again"
-    )]
-    Local { url: String, path: PathBuf, source: io::Error },
+/// How much is taken for one clip.
+#[derive(Clone, Copy, Debug)]
+struct Limits {
+    objects: usize,
+    bytes: u64,
 }
 
 /// An object of the clip.
@@ -74,15 +51,23 @@ struct Object {
     version: Version,
 }
 
+/// Where the copy of a clip is, or will be.
+pub(crate) fn folder(url: &ClipUrl, clips: &Path) -> PathBuf {
+    clips.join(url.digest()).join("files")
+}
+
 /// Copies a clip below `clips`, or what of it is new or has changed since it was copied last; files whose objects are
-/// gone are removed. Returns the clip's folder. Broken off, it keeps the objects that it finished.
+/// gone are removed. Returns the clip's folder. Broken off, it keeps the objects that it finished. While the job `user`
+/// works on the copy, it is not made another clip.
 pub(crate) async fn copy(
     url: &ClipUrl,
     options: &StoreOptions,
     clips: &Path,
+    user: Option<String>,
 ) -> Result<PathBuf, RemoteClipError> {
-    let store = stores::open(url, options).map_err(|error| stores::refused(url, options, &error))?;
-    Copying { store: store.as_ref(), url, options, folder: clips.join(url.digest()) }.run().await
+    let store = stores::open(url, options).map_err(|error| stores::unopened(url, options, &error))?;
+    let folder = clips.join(url.digest());
+    Copying { store: store.as_ref(), url, options, folder, user, limits: LIMITS }.run().await
 }
 
 struct Copying<'a> {
@@ -90,23 +75,48 @@ struct Copying<'a> {
     url: &'a ClipUrl,
     options: &'a StoreOptions,
     folder: PathBuf,
+    user: Option<String>,
+    limits: Limits,
+}
+
+/// The folder of what is being copied; gone with it.
+struct Partial(PathBuf);
+
+impl Partial {
+    fn create(folder: PathBuf) -> io::Result<Self> {
+        if folder.exists() {
+            std::fs::remove_dir_all(&folder)?;
+        }
+        std::fs::create_dir(&folder)?;
+        Ok(Self(folder))
+    }
+}
+
+impl Drop for Partial {
+    fn drop(&mut self) {
+        // What cannot be removed now is removed by the next copy, or fails it.
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
 }
 
 impl Copying<'_> {
     async fn run(&self) -> Result<PathBuf, RemoteClipError> {
         let objects = self.list().await?;
-        let (files, partial) = (self.folder.join("files"), self.folder.join("partial"));
+        let (files, manifest) = (self.folder.join("files"), self.folder.join("manifest.jsonl"));
+        let unwritable = |source| RemoteClipError::unwritable(self.url, &self.folder, source);
+        if let Some(job) = &self.user
+            && differs(&manifest::read(&manifest).map_err(unwritable)?, &objects)
+        {
+            return Err(RemoteClipError::InUse { url: self.url.to_string(), job: job.clone() });
+        }
         let names: BTreeSet<&Path> = objects.iter().map(|object| object.name.as_path()).collect();
-        let prepare = || -> io::Result<Manifest> {
+        let prepare = || -> io::Result<(Partial, Manifest)> {
             std::fs::create_dir_all(&files)?;
             remove_others(&files, Path::new(""), &names)?;
-            if partial.exists() {
-                std::fs::remove_dir_all(&partial)?;
-            }
-            std::fs::create_dir(&partial)?;
-            Manifest::open(&self.folder.join("manifest.jsonl"), |name| names.contains(name))
+            let partial = Partial::create(self.folder.join("partial"))?;
+            Ok((partial, Manifest::open(&manifest, |name| names.contains(name))?))
         };
-        let mut manifest = prepare().map_err(|source| self.unwritable(&self.folder, source))?;
+        let (partial, mut manifest) = prepare().map_err(unwritable)?;
         let is_copied = |object: &Object| {
             manifest.version(&object.name) == Some(&object.version)
                 && std::fs::metadata(files.join(&object.name))
@@ -115,7 +125,7 @@ impl Copying<'_> {
         let (present, missing): (Vec<_>, Vec<_>) = objects.into_iter().partition(is_copied);
         let (url, bytes) = (self.url, bytes_of(&missing));
         tracing::info!(%url, objects = missing.len(), bytes, present = present.len(), "copying the clip");
-        self.copy_objects(missing, &files, &partial, &mut manifest).await?;
+        self.copy_objects(missing, &files, &partial.0, &mut manifest).await?;
         tracing::info!(%url, folder = %files.display(), "the clip is copied");
         Ok(files)
     }
@@ -135,9 +145,9 @@ impl Copying<'_> {
         let mut copies = stream::iter(copies).buffer_unordered(CONCURRENT);
         while let Some(object) = copies.try_next().await? {
             let recorded = manifest.record(&object.name, &object.version);
-            recorded.map_err(|source| self.unwritable(&self.folder, source))?;
+            recorded.map_err(|source| RemoteClipError::unwritable(self.url, &self.folder, source))?;
             let before = done;
-            done += object.version.size;
+            done = object.version.size.saturating_add(done);
             if report_number(before, total) != report_number(done, total) {
                 tracing::info!(url = %self.url, bytes = done, of = total, "copying the clip");
             }
@@ -147,15 +157,16 @@ impl Copying<'_> {
 
     /// Every object of the clip, in order; empty ones that only stand for a folder are left out.
     async fn list(&self) -> Result<Vec<Object>, RemoteClipError> {
-        let listed: Vec<ObjectMeta> = self
-            .store
-            .list(Some(self.url.prefix()))
-            .try_collect()
-            .await
-            .map_err(|error| self.refused(&error))?;
+        let mut listed = self.store.list(Some(self.url.prefix()));
         let mut objects = BTreeMap::new();
-        // A console's "folder" is an empty object; that of the clip itself has no name below it.
-        for meta in listed.into_iter().filter(|meta| meta.location != *self.url.prefix()) {
+        while let Some(meta) = listed.try_next().await.map_err(|error| self.refused(&error))? {
+            if objects.len() == self.limits.objects {
+                return Err(self.too_large(format!("{} objects", self.limits.objects)));
+            }
+            // A console's "folder" is an empty object; that of the clip itself has no name below it.
+            if meta.location == *self.url.prefix() {
+                continue;
+            }
             let named = local_name(self.url.prefix().as_ref(), meta.location.as_ref());
             let name = named.map_err(|reason| self.misnamed(meta.location.as_ref(), reason))?;
             let version =
@@ -171,42 +182,11 @@ impl Copying<'_> {
         if objects.is_empty() {
             return Err(RemoteClipError::Empty { url: self.url.to_string() });
         }
-        Ok(objects.into_values().collect())
-    }
-
-    async fn copy_object(
-        &self,
-        object: &Object,
-        partial: &Path,
-        target: &Path,
-    ) -> Result<(), RemoteClipError> {
-        let changed = |reason: String| RemoteClipError::Changed {
-            url: self.url.to_string(),
-            name: object.location.to_string(),
-            reason,
-        };
-        let got = self.store.get(&object.location).await.map_err(|error| match error {
-            object_store::Error::NotFound { .. } => changed("was removed while the clip was copied".into()),
-            error => self.refused(&error),
-        })?;
-        let unwritable = |source| self.unwritable(target, source);
-        let mut file = tokio::fs::File::create(partial).await.map_err(unwritable)?;
-        let mut chunks = got.into_stream();
-        let mut written = 0;
-        while let Some(chunk) = chunks.try_next().await.map_err(|error| self.refused(&error))? {
-            file.write_all(&chunk).await.map_err(unwritable)?;
-            written += chunk.len() as u64;
+        let objects: Vec<Object> = objects.into_values().collect();
+        if bytes_of(&objects) > self.limits.bytes {
+            return Err(self.too_large(format!("{} bytes", self.limits.bytes)));
         }
-        if written != object.version.size {
-            let listed = object.version.size;
-            return Err(changed(format!("has {written} bytes, but was listed with {listed}")));
-        }
-        // Before the rename, so that a power cut leaves the old file or the new one, never an empty one.
-        file.sync_all().await.map_err(unwritable)?;
-        if let Some(folder) = target.parent() {
-            tokio::fs::create_dir_all(folder).await.map_err(unwritable)?;
-        }
-        tokio::fs::rename(partial, target).await.map_err(unwritable)
+        Ok(objects)
     }
 
     fn refused(&self, error: &object_store::Error) -> RemoteClipError {
@@ -217,13 +197,19 @@ impl Copying<'_> {
         RemoteClipError::Name { url: self.url.to_string(), name: name.to_owned(), reason }
     }
 
-    fn unwritable(&self, path: &Path, source: io::Error) -> RemoteClipError {
-        RemoteClipError::Local { url: self.url.to_string(), path: path.to_owned(), source }
+    fn too_large(&self, limit: String) -> RemoteClipError {
+        RemoteClipError::TooLarge { url: self.url.to_string(), limit }
     }
 }
 
 fn bytes_of(objects: &[Object]) -> u64 {
-    objects.iter().map(|object| object.version.size).sum()
+    objects.iter().fold(0, |sum, object| object.version.size.saturating_add(sum))
+}
+
+/// Whether the objects are others than those that were copied.
+fn differs(copied: &BTreeMap<PathBuf, Version>, objects: &[Object]) -> bool {
+    copied.len() != objects.len()
+        || objects.iter().any(|object| copied.get(&object.name) != Some(&object.version))
 }
 
 /// Which of the reports is due after `done` bytes of `total`.
@@ -268,128 +254,4 @@ fn remove_others(root: &Path, folder: &Path, names: &BTreeSet<&Path>) -> io::Res
         }
     }
     Ok(is_empty)
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used, reason = "tests")]
-
-    use object_store::{PutPayload, memory::InMemory};
-
-    use super::*;
-
-    struct Bench {
-        store: InMemory,
-        folder: tempfile::TempDir,
-    }
-
-    impl Bench {
-        fn new() -> Self {
-            Self { store: InMemory::new(), folder: tempfile::tempdir().unwrap() }
-        }
-
-        async fn put(&self, name: &str, bytes: &'static [u8]) {
-            self.store.put(&name.into(), PutPayload::from_static(bytes)).await.unwrap();
-        }
-
-        async fn copy(&self) -> Result<PathBuf, RemoteClipError> {
-            let url = ClipUrl::parse("s3://bucket/a/clip").unwrap();
-            let options = StoreOptions::default();
-            let folder = self.folder.path().to_owned();
-            Copying { store: &self.store, url: &url, options: &options, folder }.run().await
-        }
-
-        fn files(&self) -> Vec<(String, Vec<u8>)> {
-            let root = self.folder.path().join("files");
-            let listed = crate::output::list_files(&root, &[]).unwrap();
-            listed
-                .iter()
-                .map(|name| (name.display().to_string(), std::fs::read(root.join(name)).unwrap()))
-                .collect()
-        }
-    }
-
-    #[tokio::test]
-    async fn a_copy_follows_the_objects() {
-        let bench = Bench::new();
-        bench.put("a/clip/images/cam00/1.png", b"one").await;
-        bench.put("a/clip/images/cam01/1.png", b"two").await;
-        bench.put("a/clip/images", b"").await;
-        bench.put("a/clip2/other", b"not ours").await;
-        let files = bench.copy().await.unwrap();
-        assert_eq!(files, bench.folder.path().join("files"));
-        let expected = |names: &[(&str, &[u8])]| {
-            names.iter().map(|(name, bytes)| ((*name).to_owned(), bytes.to_vec())).collect::<Vec<_>>()
-        };
-        assert_eq!(
-            bench.files(),
-            expected(&[("images/cam00/1.png", b"one"), ("images/cam01/1.png", b"two")])
-        );
-
-        // An untouched object is not read again: what stands in its place here stays.
-        std::fs::write(files.join("images/cam00/1.png"), b"ONE").unwrap();
-        bench.put("a/clip/images/cam02/1.png", b"three").await;
-        bench.store.delete(&"a/clip/images/cam01/1.png".into()).await.unwrap();
-        bench.copy().await.unwrap();
-        assert_eq!(
-            bench.files(),
-            expected(&[("images/cam00/1.png", b"ONE"), ("images/cam02/1.png", b"three")])
-        );
-        assert!(!files.join("images/cam01").exists(), "an empty folder would be a camera without images");
-
-        // A changed object is copied again, and so is a file that is gone.
-        bench.put("a/clip/images/cam00/1.png", b"two").await;
-        std::fs::remove_file(files.join("images/cam02/1.png")).unwrap();
-        bench.copy().await.unwrap();
-        assert_eq!(
-            bench.files(),
-            expected(&[("images/cam00/1.png", b"two"), ("images/cam02/1.png", b"three")])
-        );
-    }
-
-    #[tokio::test]
-    async fn nothing_under_the_prefix_and_an_object_that_is_a_folder_are_errors() {
-        let bench = Bench::new();
-        bench.put("a/clip2/other", b"not ours").await;
-        let error = bench.copy().await.unwrap_err().to_string();
-        assert!(error.contains("s3://bucket/a/clip") && error.contains("prefix"), "{error}");
-        bench.put("a/clip/x", b"file").await;
-        bench.put("a/clip/x/y", b"file").await;
-        let error = bench.copy().await.unwrap_err().to_string();
-        assert!(error.contains("a/clip/x") && error.contains("folder"), "{error}");
-        assert!(!bench.folder.path().join("files").exists(), "nothing is touched before the names are known");
-    }
-
-    #[test]
-    fn no_object_leaves_the_folder() {
-        assert_eq!(local_name("a/clip", "a/clip/images/1.png"), Ok("images/1.png".into()));
-        assert_eq!(local_name("", "images/..png"), Ok("images/..png".into()));
-        for location in [
-            "a/clip/../x",
-            "a/clip/x/../../../y",
-            "a/clip/./x",
-            "a/clip//etc/passwd",
-            "a/clip/",
-            "a/clip/x/",
-            "a/clip",
-            "a/clip2/x",
-            "../a/clip/x",
-            "a/clip/..\\x",
-            "a/clip/x\0",
-            "a/clip/x\n",
-        ] {
-            assert!(local_name("a/clip", location).is_err(), "{location:?}");
-        }
-        for location in ["/etc/passwd", "..", ""] {
-            assert!(local_name("", location).is_err(), "{location:?}");
-        }
-    }
-
-    #[test]
-    fn reports_are_few() {
-        let due = (0..=1000).map(|done| report_number(done, 1000)).collect::<BTreeSet<_>>();
-        assert_eq!(due.len() as u64, REPORTS + 1);
-        assert_eq!(report_number(0, 0), 0);
-        assert_eq!(report_number(u64::MAX, u64::MAX), REPORTS);
-    }
 }

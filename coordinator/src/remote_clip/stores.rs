@@ -77,6 +77,8 @@ pub(super) fn open(url: &ClipUrl, options: &StoreOptions) -> object_store::Resul
             Arc::new(options.apply("AWS_", builder, set).with_url(address).build()?)
         }
         ObjectStoreScheme::GoogleCloudStorage => {
+            // A machine's own credentials come by plain HTTP.
+            let client = client.with_allow_http(true);
             let builder = GoogleCloudStorageBuilder::new().with_client_options(client).with_retry(retry);
             let set = |builder: GoogleCloudStorageBuilder, key: GoogleConfigKey, value: &str| {
                 builder.with_config(key, value)
@@ -114,14 +116,29 @@ pub(super) fn refused(url: &ClipUrl, options: &StoreOptions, error: &object_stor
         };
     }
     let cause = cause(error, options);
-    let is_about = |words: &[&str]| words.iter().any(|word| cause.contains(word));
-    let (remedy, may_pass) = if is_about(&["401 ", "403 "]) {
+    let is_http = *url.scheme() == ObjectStoreScheme::Http;
+    let is_status = |statuses: &[&str]| statuses.iter().any(|status| cause.starts_with(status));
+    let (remedy, may_pass) = if is_status(&["403 "]) && is_http {
+        (
+            "the server must let everybody read the clip and list its folders: PROPFIND with Depth infinity; give a path or \
+             another store if it cannot",
+            false,
+        )
+    } else if is_status(&["401 ", "403 "]) {
         (credentials_remedy(url.scheme()), false)
-    } else if is_about(&["404 "]) {
+    } else if is_status(&["404 "]) {
         ("check the bucket, its region, and the endpoint of the service", false)
-    } else if is_about(&["405 ", "501 "]) && *url.scheme() == ObjectStoreScheme::Http {
+    } else if is_status(&["405 ", "501 "]) && is_http {
         (
             "http:// and https:// need a WebDAV server, which lists its folders; give a path or another store",
+            false,
+        )
+    } else if is_status(&["400 ", "301 ", "302 ", "307 ", "308 ", "Received redirect"]) {
+        ("check credentials, region and endpoint in the coordinator's environment", false)
+    } else if cause.contains("scheme is not allowed") {
+        (
+            "give an endpoint with https://, or set AWS_ALLOW_HTTP=true (for Azure AZURE_ALLOW_HTTP=true) in the \
+             coordinator's environment",
             false,
         )
     } else if matches!(error, object_store::Error::InvalidPath { .. }) {
@@ -130,6 +147,23 @@ pub(super) fn refused(url: &ClipUrl, options: &StoreOptions, error: &object_stor
         ("check region, endpoint and network, then submit again: what was copied is kept", true)
     };
     RemoteClipError::Store { url: url.to_string(), cause, remedy, may_pass }
+}
+
+/// Why a store could not even be set up. The environment or the URL is at fault: it will not pass.
+pub(super) fn unopened(
+    url: &ClipUrl,
+    options: &StoreOptions,
+    error: &object_store::Error,
+) -> RemoteClipError {
+    let (innermost, around) = innermost(error);
+    // The system names no file; who opened it does.
+    let said = if innermost.is::<std::io::Error>() { around } else { innermost };
+    RemoteClipError::Store {
+        url: url.to_string(),
+        cause: scrubbed(&said.to_string(), options),
+        remedy: credentials_remedy(url.scheme()),
+        may_pass: false,
+    }
 }
 
 fn credentials_remedy(scheme: &ObjectStoreScheme) -> &'static str {
@@ -153,11 +187,7 @@ fn credentials_remedy(scheme: &ObjectStoreScheme) -> &'static str {
 /// The innermost reason. The layers around it name addresses whose query may be a signature, and the body of an answer
 /// may repeat keys: of it, only the error's code is told.
 fn cause(error: &object_store::Error, options: &StoreOptions) -> String {
-    let mut innermost: &dyn Error = error;
-    while let Some(source) = innermost.source() {
-        innermost = source;
-    }
-    let text = innermost.to_string();
+    let text = innermost(error).0.to_string();
     let said = if let Some(answer) = text.strip_prefix("Server returned non-2xx status code: ") {
         let status = answer.split(':').next().unwrap_or_default();
         match code(answer) {
@@ -170,6 +200,15 @@ fn cause(error: &object_store::Error, options: &StoreOptions) -> String {
         text
     };
     scrubbed(&said, options)
+}
+
+/// The innermost error and the one around it.
+fn innermost(error: &object_store::Error) -> (&(dyn Error + 'static), &(dyn Error + 'static)) {
+    let (mut innermost, mut around): (&(dyn Error + 'static), &(dyn Error + 'static)) = (error, error);
+    while let Some(source) = innermost.source() {
+        (innermost, around) = (source, innermost);
+    }
+    (innermost, around)
 }
 
 /// `NoSuchBucket` of `<Error><Code>NoSuchBucket</Code>…`.
@@ -267,5 +306,61 @@ mod tests {
         let lost = said("no route to https://host/x?sig=abc with hunter2");
         assert!(lost.contains("no route to https://host/x with …;"), "{lost}");
         assert!(said("Error performing GET http://169.254.169.254/x").contains("no credentials"));
+        let answered = |url: &str, text| {
+            let error = object_store::Error::Generic { store: "x", source: Box::new(Says(text)) };
+            match refused(&ClipUrl::parse(url).unwrap(), &options(), &error) {
+                RemoteClipError::Store { remedy, may_pass, .. } => (remedy, may_pass),
+                other => panic!("{other:?}"),
+            }
+        };
+        let forbidden = answered("https://host/clip", "Server returned non-2xx status code: 403 Forbidden: ");
+        assert!(forbidden.0.contains("PROPFIND with Depth infinity") && !forbidden.1, "{forbidden:?}");
+        for text in [
+            "Server returned non-2xx status code: 400 Bad Request: ",
+            "Received redirect without LOCATION, this normally indicates an incorrectly configured region",
+        ] {
+            let answer = answered("s3://bucket/clip", text);
+            assert!(answer.0.contains("region") && !answer.1, "{text}: {answer:?}");
+        }
+        assert!(answered("s3://bucket/clip", "connection reset").1);
+    }
+
+    fn store_error(error: RemoteClipError) -> (String, bool) {
+        match &error {
+            RemoteClipError::Store { may_pass, .. } => (error.to_string(), *may_pass),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_store_that_cannot_be_set_up_names_what_is_missing_and_does_not_pass() {
+        let unopened = |url: &str, variables: &[(&str, &str)]| {
+            let variables = variables.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned()));
+            let (url, options) = (ClipUrl::parse(url).unwrap(), StoreOptions::from_variables(variables));
+            let error = open(&url, &options).unwrap_err();
+            store_error(unopened(&url, &options, &error))
+        };
+        let (said, may_pass) =
+            unopened("gs://bucket/clip", &[("GOOGLE_APPLICATION_CREDENTIALS", "/nowhere/key.json")]);
+        assert!(said.contains("/nowhere/key.json") && !may_pass, "{said}");
+        let (said, may_pass) = unopened("az://container/clip", &[]);
+        assert!(said.contains("AZURE_STORAGE_ACCOUNT_NAME") && !may_pass, "{said}");
+    }
+
+    #[tokio::test]
+    async fn an_endpoint_without_tls_has_to_be_allowed() {
+        use object_store::ObjectStore as _;
+        let variables = [
+            ("AWS_ENDPOINT_URL", "http://127.0.0.1:9"),
+            ("AWS_SKIP_SIGNATURE", "true"),
+            ("AWS_REGION", "us-east-1"),
+        ];
+        let options =
+            StoreOptions::from_variables(variables.map(|(name, value)| (name.to_owned(), value.to_owned())));
+        let url = ClipUrl::parse("s3://bucket/clip").unwrap();
+        let store = open(&url, &options).unwrap();
+        let error = store.list_with_delimiter(None).await.unwrap_err();
+        let (said, may_pass) = store_error(refused(&url, &options, &error));
+        assert!(said.contains("AWS_ALLOW_HTTP=true") && !may_pass, "{said}");
     }
 }

@@ -10,6 +10,7 @@ use trackersplat_proto::v1::{
 use super::{fetch, locate::locate_clip, state_failed, submit, uninterrupted, unknown_job, watch};
 use crate::{
     hub::SharedHub,
+    request::clip_name,
     store::{JobRecord, StoreError, Summary},
 };
 
@@ -81,13 +82,14 @@ impl Jobs for JobService {
 }
 
 fn summary_to_wire(Summary { job, done, failed }: Summary) -> Result<JobSummary, StoreError> {
+    let clip = clip_name(&job);
     Ok(JobSummary {
         state: job.state()?.to_wire().into(),
         frames: u32::try_from(job.frame_numbers()?.len()).unwrap_or(u32::MAX),
         frames_done: done,
         frames_failed: failed,
         job_id: job.id,
-        clip: job.clip,
+        clip,
         output: job.output,
         submitted_at: job.submitted_at,
     })

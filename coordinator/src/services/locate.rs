@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use tokio::sync::OwnedMutexGuard;
 use tonic::Status;
 
+use super::state_failed;
 use crate::{
     hub::Hub,
     remote_clip::{self, ClipUrl, RemoteClipError, is_remote, without_secrets},
@@ -13,6 +14,8 @@ use crate::{
 /// A clip on this machine.
 pub(super) struct LocatedClip {
     pub(super) path: PathBuf,
+    /// Where it was copied from; holds no credentials.
+    pub(super) url: Option<String>,
     /// A copy does not change while this is held.
     _copying: Option<OwnedMutexGuard<()>>,
 }
@@ -20,13 +23,18 @@ pub(super) struct LocatedClip {
 /// A clip by its path, or the copy of one in an object store. Dropped, it stops copying and keeps what it has.
 pub(super) async fn locate_clip(hub: &Hub, clip: &str) -> Result<LocatedClip, Status> {
     if !is_remote(clip) {
-        return Ok(LocatedClip { path: local_path("clip", clip)?, _copying: None });
+        return Ok(LocatedClip { path: local_path("clip", clip)?, url: None, _copying: None });
     }
     let url = ClipUrl::parse(clip).map_err(refused)?;
     let copy = async {
-        let guard = hub.copying.clone().lock_owned().await;
-        let path = remote_clip::copy(&url, &hub.options.stores, &hub.clip_folder()).await.map_err(refused)?;
-        Ok(LocatedClip { path, _copying: Some(guard) })
+        let guard = hub.copying(&url.digest()).lock_owned().await;
+        let clips = hub.clip_folder();
+        // Under the lock, under which jobs begin to use the copy.
+        let user = hub.clip_user(&remote_clip::folder(&url, &clips)).await;
+        let user = user.map_err(|error| state_failed(hub, error))?;
+        let path = remote_clip::copy(&url, &hub.options.stores, &clips, user).await.map_err(refused)?;
+        let name = url.to_string().trim_end_matches('/').to_owned();
+        Ok(LocatedClip { path, url: Some(name), _copying: Some(guard) })
     };
     let copied = hub.shutdown.run_until_cancelled(copy).await;
     copied.unwrap_or_else(|| {
@@ -42,7 +50,8 @@ fn refused(error: RemoteClipError) -> Status {
     match error {
         RemoteClipError::Store { may_pass: true, .. }
         | RemoteClipError::Changed { .. }
-        | RemoteClipError::Local { .. } => Status::unavailable(message),
+        | RemoteClipError::Local { is_full: true, .. } => Status::unavailable(message),
+        RemoteClipError::InUse { .. } | RemoteClipError::Local { .. } => Status::failed_precondition(message),
         _ => Status::invalid_argument(message),
     }
 }

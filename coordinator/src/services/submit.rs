@@ -22,7 +22,7 @@ use crate::{
     keys::VERSION,
     output::{self, Marker, OutputError},
     queue::job::JobState,
-    request::{InputFile, JobRequest, TrackSource},
+    request::{InputFile, JobRequest, TrackSource, by_url},
     store::{JobRecord, NewJob},
 };
 
@@ -58,7 +58,7 @@ impl Submission {
     fn marker(&self, job_id: &str) -> Marker {
         Marker {
             job_id: job_id.to_owned(),
-            clip: self.clip_path.display().to_string(),
+            clip: self.request.clip_url.clone().unwrap_or_else(|| self.clip_path.display().to_string()),
             clip_digest: self.clip_digest.clone(),
             settings_digest: self.settings_digest.clone(),
             version: VERSION.to_owned(),
@@ -76,10 +76,13 @@ pub(super) async fn submit(
     }
     let _one_at_a_time = hub.submitting.lock().await;
     let scratch = hub.scratch_folder();
-    let clip_path = clip.path.clone();
-    let reading = tokio::task::spawn_blocking(move || read(request, clip_path, scratch)).await;
-    let submission =
-        reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))??;
+    let (clip_path, url) = (clip.path.clone(), clip.url.clone());
+    let reading = tokio::task::spawn_blocking(move || read(request, clip_path, url, scratch)).await;
+    let submission = reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))?;
+    let submission = submission.map_err(|status| {
+        let path = clip.path.display().to_string();
+        Status::new(status.code(), by_url(status.message(), &path, clip.url.as_deref()))
+    })?;
     let known = hub
         .store
         .same_job(&submission.clip_digest, &submission.settings_digest, &submission.output_request)
@@ -137,6 +140,7 @@ async fn begin(hub: &SharedHub, submission: Submission) -> Result<SubmitResponse
 async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) -> Result<(), Status> {
     let marker = submission.marker(job_id);
     let refused = |error: OutputError| Status::failed_precondition(error.to_string());
+    let mut takes_over = false;
     if let Err(error) = output::check_owner(output, &marker) {
         let gives_way = match error.owner() {
             Some(owner) if !holds_results(output) => hub.gives_way(owner).await,
@@ -145,6 +149,7 @@ async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) 
         if !gives_way.map_err(|error| state_failed(hub, error))? {
             return Err(refused(error));
         }
+        takes_over = true;
     }
     let active = hub.active_outputs().await.map_err(|error| state_failed(hub, error))?;
     if let Some((other, _)) = active.iter().find(|(other, folder)| folder == output && other != job_id) {
@@ -153,10 +158,28 @@ async fn claim(hub: &Hub, output: &Path, submission: &Submission, job_id: &str) 
             output.display()
         )));
     }
+    if takes_over {
+        remove_description(output).map_err(refused)?;
+    }
     output::claim(output, &marker).map_err(refused)
 }
 
-fn read(request: SubmitRequest, clip_path: PathBuf, scratch: PathBuf) -> Result<Submission, Status> {
+/// The former owner's description of a sequence without frames would pass for the new one's.
+fn remove_description(output: &Path) -> Result<(), OutputError> {
+    match std::fs::remove_file(output.join(SEQUENCE)) {
+        Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+            Err(OutputError::Unwritable { output: output.to_owned(), source })
+        }
+        _ => Ok(()),
+    }
+}
+
+fn read(
+    request: SubmitRequest,
+    clip_path: PathBuf,
+    clip_url: Option<String>,
+    scratch: PathBuf,
+) -> Result<Submission, Status> {
     let settings = read_settings(&request.settings_json)?;
     let mut job_request = JobRequest {
         frames: read_frames(request.first_frame, request.last_frame)?,
@@ -166,6 +189,7 @@ fn read(request: SubmitRequest, clip_path: PathBuf, scratch: PathBuf) -> Result<
             path => Some(input_file("static model", path)?),
         },
         tracks: read_tracks(request.tracks)?,
+        clip_url,
         ..JobRequest::default()
     };
     let options = job_request.clip_options(scratch);

@@ -84,9 +84,12 @@ impl WorkerStream {
         let Registered { session, close } = self.hub.register(register, self.outgoing.clone()).await?;
         // Nothing of the conversation is used after a panic.
         let ended = AssertUnwindSafe(self.converse(session, &close)).catch_unwind().await;
+        if ended.is_err() {
+            tracing::error!(worker_id = register.worker_id, "the worker's stream panicked");
+            self.hub.report_panicked(session).await?;
+        }
         self.hub.disconnected(session).await?;
         ended.unwrap_or_else(|_| {
-            tracing::error!(worker_id = register.worker_id, "the worker's stream panicked");
             Ok(Some(Status::internal("the coordinator has a defect; its log says which. Connect again")))
         })
     }

@@ -23,7 +23,7 @@ use trackersplat_proto::v1::{
     jobs_client::JobsClient, report::Outcome, worker_message, workers_client::WorkersClient,
 };
 
-use crate::{Running, ServeError, ServeOptions, serve};
+use crate::{Running, ServeError, ServeOptions, hub::Hub, serve};
 
 /// Longest wait for anything; reached only when a test fails.
 const PATIENCE: Duration = Duration::from_secs(15);
@@ -117,6 +117,10 @@ impl Bench {
         let (running, shutdown) = self.running.take().unwrap();
         shutdown.cancel();
         within(running.finished()).await.unwrap();
+    }
+
+    pub(super) fn hub(&self) -> Arc<Hub> {
+        self.running.as_ref().and_then(|(running, _)| running.hub.upgrade()).expect("it runs")
     }
 
     pub(super) fn path(&self, name: &str) -> String {

@@ -5,6 +5,7 @@ mod jobs;
 mod leases;
 mod ownership;
 mod remote_clips;
+mod reports;
 mod restart;
 mod runs;
 mod transfers;

@@ -49,6 +49,23 @@ async fn a_job_that_finished_no_frame_leaves_its_folder_to_the_repaired_clip() {
 }
 
 #[tokio::test]
+async fn a_job_whose_frames_all_failed_leaves_its_folder_to_the_next() {
+    let bench = Bench::start().await;
+    let failed = bench.submitted().await;
+    let mut worker = bench.worker("w").await;
+    for _ in 0..3 {
+        let lease = worker.lease().await;
+        worker.fail(&lease, trackersplat_proto::v1::FailureKind::BadInput).await;
+    }
+    assert_eq!(bench.ended(&failed).await.0, JobState::Failed);
+    let described = bench.folder.path().join("out/sequence.json");
+    assert!(described.exists(), "it is assembled all the same");
+    let next = bench.submit(seeded(&bench)).await.unwrap().job_id;
+    assert_eq!(owner(&bench), next);
+    assert!(!described.exists(), "it describes nothing that is there");
+}
+
+#[tokio::test]
 async fn the_folder_of_a_job_that_goes_on_is_refused() {
     let mut bench = Bench::start().await;
     let job = bench.submitted().await;

@@ -145,6 +145,74 @@ async fn a_clip_in_an_object_store_is_the_same_job_as_by_path_and_is_copied_once
 }
 
 #[tokio::test]
+async fn a_clip_that_changes_under_a_job_is_refused_until_the_job_has_ended() {
+    let bucket = Bucket::start().await;
+    let mut bench = bucket.bench(SECRET).await;
+    let request = from(&bench, "s3://clips/set/clip");
+    let job = bench.submit(request.clone()).await.unwrap().job_id;
+    let image = "set/clip/images/cam01/frame_0002.png";
+    let changed = splat::image::Image::filled(8, 6, [0.9; 3]).encode_png();
+    std::fs::write(bucket.folder.path().join("clips").join(image), changed).unwrap();
+    let other = SubmitRequest { output: bench.path("out2"), ..request.clone() };
+    for _ in 0..2 {
+        let refused = bench.submit(other.clone()).await.unwrap_err();
+        assert_eq!(refused.code(), Code::FailedPrecondition, "{refused}");
+        for part in [job.as_str(), "cancel", "s3://clips/set/clip"] {
+            assert!(refused.message().contains(part), "no {part:?} in {refused}");
+        }
+        // After a restart, too, when the job has not opened its clip again.
+        bench.stop().await;
+        bench.restart().await;
+    }
+    let mut worker = bench.worker("w").await;
+    for _ in 0..3 {
+        worker.work_once(&bench).await;
+    }
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
+    let next = bench.submit(other).await.unwrap();
+    assert!(!next.resumed && next.job_id != job);
+}
+
+#[tokio::test]
+async fn people_read_the_url_and_not_the_copys_path() {
+    let bucket = Bucket::start().await;
+    let bench = bucket.bench(SECRET).await;
+    let url = "s3://clips/set/clip";
+    let request = from(&bench, "s3://clips/set/clip/");
+    let job = bench.submit(request.clone()).await.unwrap().job_id;
+    let listed = bench.jobs().list(ListRequest {}).await.unwrap().into_inner().jobs;
+    assert_eq!(listed[0].clip, url);
+    let json = |name: &str| -> serde_json::Value {
+        serde_json::from_slice(&std::fs::read(bench.folder.path().join(name)).unwrap()).unwrap()
+    };
+    assert_eq!(json("out/trackersplat.json")["clip"], url);
+    let mut worker = bench.worker("w").await;
+    for _ in 0..3 {
+        worker.work_once(&bench).await;
+    }
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
+    let described = json("out/sequence.json");
+    assert_eq!(described["clip"]["url"], url);
+    assert!(std::path::Path::new(described["clip"]["path"].as_str().unwrap()).is_dir());
+
+    let frames =
+        SubmitRequest { first_frame: 8, last_frame: 9, output: bench.path("out2"), ..request.clone() };
+    let refused = bench.submit(frames).await.unwrap_err();
+    assert!(refused.message().contains(url) && !refused.message().contains(&bench.path("root")), "{refused}");
+    // An image that cannot be decoded fails the job, by the object's name.
+    let image = bucket.folder.path().join("clips/set/clip/images/cam01/frame_0002.png");
+    let whole = std::fs::read(&image).unwrap();
+    std::fs::write(&image, &whole[..whole.len() / 2]).unwrap();
+    let damaged = SubmitRequest { output: bench.path("out3"), ..request };
+    let job = bench.submit(damaged).await.unwrap().job_id;
+    let failure = bench.ended(&job).await.1.unwrap();
+    for part in [url, "images/cam01/frame_0002.png"] {
+        assert!(failure.message.contains(part), "no {part:?} in {failure:?}");
+    }
+    assert!(!failure.message.contains(&bench.path("root")), "{failure:?}");
+}
+
+#[tokio::test]
 async fn a_copy_that_is_broken_off_goes_on_where_it_was() {
     let bucket = Bucket::start().await;
     let bench = bucket.bench(SECRET).await;
