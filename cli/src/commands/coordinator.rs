@@ -34,9 +34,10 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds, help_heading = "Leases")]
     lease_duration: Duration,
 
-    /// Seconds that a lease waits for its worker to come back after the connection broke; at most --lease-duration.
-    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds, help_heading = "Leases")]
-    reconnect_grace: Duration,
+    /// Seconds that a lease waits for its worker to come back after the connection broke [default: 3, at most
+    /// --lease-duration].
+    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Leases")]
+    reconnect_grace: Option<Duration>,
 
     /// Failed attempts that a frame may have.
     #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Leases")]
@@ -48,16 +49,18 @@ pub(crate) struct CoordinatorArgs {
 
 pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
     let interrupted = interrupt::token()?;
+    let defaults = ServeOptions::default();
+    let reconnect_grace = args.reconnect_grace.unwrap_or(defaults.reconnect_grace.min(args.lease_duration));
     let options = ServeOptions {
         root: args.root,
         listen: args.listen,
         compute_threads: args.compute_threads.unwrap_or_else(cores),
         heartbeat_interval: args.heartbeat_interval,
         lease_duration: args.lease_duration,
-        reconnect_grace: args.reconnect_grace,
+        reconnect_grace,
         max_attempts: args.max_attempts,
         stores: environment::stores(),
-        ..ServeOptions::default()
+        ..defaults
     };
     let running = serve(options, Arc::new(args.engine.engine()?), interrupted).await?;
     // For scripts that let the system choose the port.
