@@ -164,7 +164,7 @@ impl JobArgs {
 pub(crate) struct EngineArgs {
     /// Instruction set of the processor [default: the widest; possible values: avx512, avx2, baseline].
     ///
-    /// avx512 and avx2 give the same bytes, baseline others: force it where machines without AVX2 share a job with others.
+    /// avx512 and avx2 give the same bytes, baseline others, by rounding.
     #[arg(long, value_name = "SET", help_heading = "Execution")]
     pub(crate) instructions: Option<InstructionSet>,
 }

@@ -5,11 +5,7 @@
     reason = "tests; `--nocapture` shows the errors that were found"
 )]
 
-use splat::{
-    engine::Engine,
-    raster::{CpuEngine, Instructions},
-    tracking::TrackField,
-};
+use splat::{engine::Engine, raster::CpuEngine, simd::Instructions, tracking::TrackField};
 use trackersplat_tests::golden::{Golden, largest_difference, relative_norm};
 
 const SCENES: [&str; 7] = ["basic", "degree0", "needles", "opaque", "near", "faint", "unnormalised"];

@@ -13,7 +13,7 @@ pub(crate) struct PeerStep {
 }
 
 /// Where and how the figures were taken.
-pub(crate) const MEASURED_ON: &str = "peers: 2 vCPU Sapphire Rapids (about 2.5 GHz, AVX-512), nothing else running; median of 5 (OpenSplat) and 3 (Brush)";
+pub(crate) const MEASURED_ON: &str = "peers: 2 vCPU Sapphire Rapids (about 2.5 GHz, AVX-512), nothing else running; median of 5 (OpenSplat, its depth sort mended) and 3 (Brush)";
 
 const fn peer(
     gaussians: usize,

@@ -3,11 +3,11 @@
 use super::{depth_order::DepthOrder, project::Projection};
 
 /// Rows per band: the unit of parallel work, independent of the number of threads.
-pub const BAND_ROWS: usize = 16;
+pub(super) const BAND_ROWS: usize = 16;
 
 /// Footprints of a view and, per band, those that touch it in depth order.
 #[derive(Clone, Debug, Default)]
-pub struct Bins {
+pub(super) struct Bins {
     /// What [`Bins::sort`] sorts.
     pub projection: Projection,
     /// `entries[starts[b]..starts[b + 1]]` belong to band `b`.
@@ -24,17 +24,17 @@ pub struct Bins {
 
 impl Bins {
     /// Number of bands.
-    pub fn bands(&self) -> usize {
+    pub(super) fn bands(&self) -> usize {
         self.starts.len().saturating_sub(1)
     }
 
     /// Gaussians that touch a band, nearest first.
-    pub fn band(&self, band: usize) -> &[u32] {
+    pub(super) fn band(&self, band: usize) -> &[u32] {
         &self.entries[self.starts[band] as usize..self.starts[band + 1] as usize]
     }
 
     /// The places of Gaussian `index` in the lists of the bands that it touches, and the first of these bands.
-    pub fn places_of(&self, index: usize) -> (usize, &[u32]) {
+    pub(super) fn places_of(&self, index: usize) -> (usize, &[u32]) {
         let places = self.first_place[index] as usize..self.first_place[index + 1] as usize;
         (self.projection.bands[index].first as usize, &self.places[places])
     }
@@ -42,7 +42,7 @@ impl Bins {
     /// Sorts the visible Gaussians by depth, ties in index order, and distributes them over the bands of an image of
     /// `height` rows. `order` is what it was after an earlier step of the same view, or empty: it saves time, and
     /// becomes the new order.
-    pub fn sort(&mut self, height: u32, order: &mut Vec<u32>) {
+    pub(super) fn sort(&mut self, height: u32, order: &mut Vec<u32>) {
         self.depth_order.sort(&self.projection.depths, order);
         self.distribute((height as usize).div_ceil(BAND_ROWS), order);
     }

@@ -18,10 +18,8 @@ pub(super) struct Band {
     pub rows: usize,
     /// Columns of the image.
     pub width: usize,
-    /// Per block, transmittance left per pixel.
-    pub transmittance: Vec<[f32; LANES]>,
     /// Per block and pixel, how many footprints of the block's list came before blending stopped.
-    /// Single precision counts exactly to 2²⁴, more than a block's list can hold in memory.
+    /// Single precision counts exactly to 2²⁴.
     pub last: Vec<[f32; LANES]>,
     /// What the list of the block at hand did, while it is replayed.
     pub blended: Vec<Blended>,
@@ -49,7 +47,6 @@ impl Band {
         self.width = width;
         fill(instructions, &mut self.lists, bins, number, width, height, active);
         // Every block writes all of its values.
-        self.transmittance.resize(self.lists.blocks(), [0.0; LANES]);
         self.last.resize(self.lists.blocks(), [0.0; LANES]);
     }
 
@@ -119,7 +116,6 @@ fn blend_kernel<S: Simd>(band: &mut Band, background: [f32; 3], pixels: &mut [f3
         let (column, row) = corner(block);
         let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
         let blended = blend_block::<S>(&band.lists.entries, band.lists.of(block), x, y, &is_inside);
-        band.transmittance[block] = blended.transmittance;
         band.last[block] = blended.last;
         for (lane, place) in band.pixels(block) {
             let transmittance = blended.transmittance[lane];

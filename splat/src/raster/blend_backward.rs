@@ -25,7 +25,7 @@ use crate::simd::{Group, LANES, ROWS, Simd, prefetch, simd_kernel};
 /// With `v = alpha · ∂loss/∂alpha`, `d` the offset from the row centre and `dy` that from the mean's row, the moments of
 /// `v` suffice for the footprint's position and shape.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct FootprintGradient {
+pub(super) struct FootprintGradient {
     /// `Σ v`: by the logarithm of the opacity.
     pub v: f64,
     /// `Σ v d`.

@@ -195,7 +195,8 @@ struct Reaches {
     /// `2 · variance along a row`, and what the exponent may still fall there.
     double_conditional: [f32; LANES],
     reach: [f32; LANES],
-    half_inverse_yy: [f32; LANES],
+    /// Root of half the inverse variance across rows: squared with the offset, so that neither overflows alone.
+    fall: [f32; LANES],
     half_height: [f32; LANES],
     row_of_rightmost: [f32; LANES],
 }
@@ -210,7 +211,7 @@ impl Reaches {
             (&mut self.slope, footprint.slope),
             (&mut self.double_conditional, 2.0 * footprint.conditional),
             (&mut self.reach, footprint.reach),
-            (&mut self.half_inverse_yy, 0.5 * footprint.inverse_yy),
+            (&mut self.fall, (0.5 * footprint.inverse_yy).sqrt()),
             (&mut self.half_height, footprint.half_height),
             (&mut self.row_of_rightmost, footprint.row_of_rightmost),
         ];
@@ -238,8 +239,8 @@ impl Reaches {
         let below = S::load(&edges[1]).sub(y).min(height);
         let (x, slope, rightmost) = (S::load(&self.x), S::load(&self.slope), S::load(&self.row_of_rightmost));
         let half = |dy: S| {
-            let fall = dy.mul(dy).mul(S::load(&self.half_inverse_yy));
-            S::load(&self.reach).sub(fall).max(zero).mul(S::load(&self.double_conditional)).sqrt()
+            let root = dy.mul(S::load(&self.fall));
+            S::load(&self.reach).sub(root.mul(root)).max(zero).mul(S::load(&self.double_conditional)).sqrt()
         };
         let (left_row, right_row) =
             (zero.sub(rightmost).max(above).min(below), rightmost.max(above).min(below));
@@ -271,7 +272,9 @@ impl Reaches {
 mod tests {
     use super::*;
     use crate::{
-        raster::rows,
+        cameras::Camera,
+        gaussians::Gaussians,
+        raster::{project::project, rows},
         simd::Instructions,
         testing::{arc, blobs},
     };
@@ -292,33 +295,57 @@ mod tests {
         blocks
     }
 
-    #[test]
-    fn every_block_with_a_pixel_in_reach_is_listed_and_few_others() {
-        let (width, height) = (70, 45);
-        let camera = &arc(3, width, height)[1];
-        let (width, height) = (width as usize, height as usize);
-        let gaussians = blobs(400, 5);
+    /// Listed and needed blocks of all bands; fails if a needed one is not listed.
+    fn listed_and_needed(gaussians: &Gaussians, camera: &Camera, instructions: Instructions) -> [usize; 2] {
+        let (width, height) = (camera.width as usize, camera.height as usize);
         let mut bins = Bins::default();
-        crate::raster::project::project(Instructions::detect(), &gaussians, camera, 0, &mut bins.projection);
+        project(instructions, gaussians, camera, 0, &mut bins.projection);
         bins.sort(camera.height, &mut Vec::new());
         let (mut listed, mut needed) = (0, 0);
         let mut lists = BlockLists::default();
         for number in 0..bins.bands() {
-            fill(Instructions::detect(), &mut lists, &bins, number, width, height, &[]);
+            fill(instructions, &mut lists, &bins, number, width, height, &[]);
             for (place, &index) in bins.band(number).iter().enumerate() {
-                let expected =
-                    blocks_by_rows(&bins.projection.footprints[index as usize], number, width, height);
+                let footprint = &bins.projection.footprints[index as usize];
+                let expected = blocks_by_rows(footprint, number, width, height);
                 let is_listed = |block: &usize| lists.of(*block).contains(&(place as u32));
                 assert!(expected.iter().all(is_listed), "footprint {index} misses a block of band {number}");
                 needed += expected.len();
             }
-            listed += (0..lists.blocks()).map(|block| lists.of(block).len()).sum::<usize>();
             for block in 0..lists.blocks() {
+                listed += lists.of(block).len();
                 assert!(lists.of(block).is_sorted(), "nearest first");
             }
         }
-        // Rows between two pixel centres may reach a little farther than either.
-        assert!(listed < needed + needed / 20, "{listed} listed, {needed} needed");
-        assert!(needed > 1000, "the test would show nothing with {needed}");
+        [listed, needed]
+    }
+
+    #[test]
+    fn every_block_with_a_pixel_in_reach_is_listed_and_few_others() {
+        for instructions in Instructions::available() {
+            let [listed, needed] = listed_and_needed(&blobs(400, 5), &arc(3, 70, 45)[1], instructions);
+            // Rows between two pixel centres may reach a little farther than either.
+            assert!(listed < needed + needed / 20, "{listed} listed, {needed} needed");
+            assert!(needed > 1000, "the test would show nothing with {needed}");
+        }
+    }
+
+    #[test]
+    fn needles_giants_and_footprints_from_outside_miss_no_block() {
+        let mut gaussians = blobs(300, 6);
+        for index in 0..gaussians.len() {
+            // Standard deviations from 1e-4 to 1e4 of the scene, up to 1e8 apart in one Gaussian.
+            let stretch = [index % 5, index / 5 % 5, index / 25 % 5].map(|place| 4.6 * (place as f32 - 2.0));
+            for axis in 0..3 {
+                gaussians.log_scales[index][axis] = stretch[axis];
+                gaussians.means[index][axis] *= [1.0, 3.0, 30.0][index % 3];
+            }
+        }
+        for (width, height) in [(1, 1), (17, 13), (64, 48), (70, 45)] {
+            for instructions in Instructions::available() {
+                let [_, needed] = listed_and_needed(&gaussians, &arc(3, width, height)[1], instructions);
+                assert!(needed > 50, "{needed} blocks at {width}x{height} are no test");
+            }
+        }
     }
 }

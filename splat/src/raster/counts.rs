@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::{
     ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
     bin::{BAND_ROWS, Bins},
-    blend::{Band, Local},
+    blend::{BATCH, Band, Local},
     blocks::corner,
     project::project,
     rows::{rows, span},
@@ -29,7 +29,7 @@ pub struct PairCounts {
     pub spans: u64,
     /// Pairs in those spans: the exact ellipses, whether the pixel is still open or not.
     pub span_pairs: u64,
-    /// Blocks of [`PairCounts::lanes_per_group`] pixels times footprints that are listed for them.
+    /// Blocks of [`PairCounts::lanes_per_group`] pixels times footprints that are evaluated for them.
     pub groups: u64,
     /// Those in which at least one open pixel sees the footprint: the ones that blending must touch.
     pub live_groups: u64,
@@ -106,7 +106,11 @@ fn count_block(band: &Band, block: usize) -> PairCounts {
     let mut open = [None; LANES];
     band.pixels(block).for_each(|(lane, _)| open[lane] = Some(1.0_f32));
     let mut counts = PairCounts::default();
-    for &entry in band.lists.of(block) {
+    for (place, &entry) in band.lists.of(block).iter().enumerate() {
+        // As the kernel does, which looks after every batch.
+        if place % BATCH == 0 && open.iter().all(Option::is_none) {
+            break;
+        }
         let entry = &band.lists.entries[entry as usize];
         let mut alphas = [0.0; LANES];
         Local::new(entry, x, y).alpha::<Plain>(entry).store(&mut alphas);

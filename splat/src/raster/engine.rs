@@ -1,6 +1,10 @@
-//! The stages strung together, and the [`Engine`] they make.
+//! The [`Engine`] that the stages make.
 
-use super::{footprint_moments, pass::Pass, session::CpuSession};
+use super::{
+    footprint_moments,
+    pass::Pass,
+    session::{CpuSession, check_size},
+};
 use crate::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
@@ -24,7 +28,7 @@ impl CpuEngine {
     }
 
     /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
-    /// `H × W × 3`, `alpha_gradient` `H × W` or empty.
+    /// `H × W × 3`, `alpha_gradient` `H × W` or empty. The camera has at least one pixel.
     pub fn render_backward(
         &self,
         gaussians: &Gaussians,
@@ -55,6 +59,7 @@ impl Engine for CpuEngine {
         camera: &Camera,
         background: [f32; 3],
     ) -> Result<Rendering, EngineError> {
+        check_size(camera)?;
         let mut image = Image::filled(camera.width, camera.height, [0.0; 3]);
         let mut alpha = vec![0.0; image.pixel_count()];
         let mut pass = Pass::new(self.instructions);
@@ -68,6 +73,7 @@ impl Engine for CpuEngine {
         camera: &Camera,
         tracks: &TrackField,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
+        check_size(camera)?;
         footprint_moments::footprint_moments(self.instructions, gaussians, camera, tracks)
     }
 

@@ -1,24 +1,24 @@
 //! The CPU engine: differentiable rasterization of 3D Gaussians in blocks of 4 × 4 pixels.
 //!
 //! One file per stage, each named as the stage: [`project`] → [`bin`] → [`blend`] → [`blend_backward`] →
-//! [`project_backward`]; [`footprint_moments`] shares the first three. The equations are those of 3D Gaussian
+//! [`project_backward`], strung together by [`Pass`]; [`footprint_moments`] shares the first two. The equations are those of 3D Gaussian
 //! Splatting (Kerbl et al. 2023, section 4 and 6) over EWA splatting (Zwicker et al. 2001).
 //!
 //! An image is cut into bands of [`bin::BAND_ROWS`] rows whatever the number of threads; every sum over bands is
 //! taken in band order. So the result has the same bytes on one thread and on many.
 
-pub mod bin;
+mod bin;
 mod blend;
-pub mod blend_backward;
+mod blend_backward;
 mod blocks;
 mod colour;
 mod counts;
 mod depth_order;
 mod engine;
-pub mod footprint_moments;
+mod footprint_moments;
 mod pass;
-pub mod project;
-pub mod project_backward;
+mod project;
+mod project_backward;
 mod rows;
 mod session;
 #[cfg(test)]
@@ -37,7 +37,7 @@ pub const LOW_PASS: f64 = 0.3;
 /// A pixel on which a Gaussian has less opacity than this does not see it.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 
-/// Opacity of one Gaussian on one pixel is clamped here, so that the replay can divide by `1 - alpha`.
+/// Opacity of one Gaussian on one pixel is clamped here, so that something always shines through.
 pub const ALPHA_MAX: f32 = 0.99;
 
 /// Blending stops before the Gaussian that would bring the transmittance below this.

@@ -18,7 +18,7 @@ pub(super) const CHUNK: usize = 512;
 
 /// All Gaussians in one view, in their order.
 #[derive(Clone, Debug, Default)]
-pub struct Projection {
+pub(super) struct Projection {
     /// Meaningless for those that reach no pixel.
     pub footprints: Vec<Footprint>,
     /// Camera z, world units; NaN for those that reach no pixel.
@@ -28,15 +28,15 @@ pub struct Projection {
 }
 
 impl Projection {
-    /// Whether a Gaussian reaches a pixel.
-    pub fn is_visible(&self, index: usize) -> bool {
+    /// Whether the bounding box of a Gaussian's footprint reaches a pixel.
+    pub(super) fn is_visible(&self, index: usize) -> bool {
         !self.depths[index].is_nan()
     }
 }
 
 /// Consecutive bands.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct BandRange {
+pub(super) struct BandRange {
     /// The first.
     pub first: u32,
     /// One past the last.
@@ -50,7 +50,7 @@ pub struct BandRange {
 /// slanted the footprint is: `slope = cov_xy / cov_yy` is the regression line through the row centres and
 /// `1 / inverse_conditional = cov_xx - cov_xy² / cov_yy` the variance along a row.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Footprint {
+pub(super) struct Footprint {
     /// Projected mean, pixels.
     pub mean: [f64; 2],
     /// Row centre shift per row, `cov_xy / cov_yy`.
@@ -141,7 +141,7 @@ fn clamp_slope(slope: f64, focal: f64, principal: f64, size: f64) -> (f64, bool)
 }
 
 /// Projects every Gaussian; spherical harmonics up to `sh_degree`.
-pub fn project(
+pub(super) fn project(
     instructions: Instructions,
     gaussians: &Gaussians,
     camera: &Camera,

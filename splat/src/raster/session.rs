@@ -117,6 +117,18 @@ impl Session for CpuSession {
                 gaussians.len()
             )));
         }
+        if gaussians.sh_degree != self.gaussians.sh_degree {
+            return Err(EngineError::InvalidInput(format!(
+                "Gaussians of degree {} in a session of degree {}",
+                gaussians.sh_degree, self.gaussians.sh_degree
+            )));
+        }
+        if let Some(&old) = source.iter().flatten().find(|&&old| old >= self.gaussians.len()) {
+            return Err(EngineError::InvalidInput(format!(
+                "source {old} of {} Gaussians",
+                self.gaussians.len()
+            )));
+        }
         if !self.active.is_empty() {
             self.active = source.iter().map(|old| old.is_none_or(|old| self.active[old])).collect();
         }
@@ -130,6 +142,15 @@ impl Session for CpuSession {
 
 fn empty_statistics(count: usize) -> DensityStatistics {
     DensityStatistics { gradient_norm: vec![0.0; count], visible_steps: vec![0; count] }
+}
+
+/// An image without pixels has no rows to hand out.
+pub(super) fn check_size(camera: &Camera) -> Result<(), EngineError> {
+    if camera.width == 0 || camera.height == 0 {
+        let (width, height) = (camera.width, camera.height);
+        return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
+    }
+    Ok(())
 }
 
 fn check(input: &SessionInput) -> Result<(), EngineError> {
@@ -146,6 +167,7 @@ fn check(input: &SessionInput) -> Result<(), EngineError> {
     }
     for (number, view) in input.views.iter().enumerate() {
         let (image, camera) = (&view.image, &view.camera);
+        check_size(camera)?;
         if (image.width, image.height) != (camera.width, camera.height) {
             return Err(EngineError::InvalidInput(format!(
                 "training image {number} is {}x{}, its camera {}x{}",

@@ -30,8 +30,8 @@ pub(crate) struct Group(pub [f32; LANES]);
 
 /// A group of [`LANES`] single-precision numbers.
 ///
-/// # Safety
-/// The methods of an implementation may only run inside a function compiled with its instruction set, on a machine
+/// # Contract
+/// No function is unsafe, as every one would be: the methods of an implementation may only run inside a function compiled with its instruction set, on a machine
 /// that has it; [`simd_kernel!`] is the only place that chooses one.
 pub(crate) trait Simd: Copy {
     /// One flag per lane.
@@ -88,16 +88,17 @@ pub(crate) trait Simd: Copy {
     }
 }
 
-/// Asks for the memory of a value that will be read soon.
+/// Asks for the memory of a value, of at least a byte, that will be read soon.
 #[inline(always)]
 pub(crate) fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         let address = std::ptr::from_ref(value).cast::<i8>();
-        for line in 0..size_of::<T>().div_ceil(64) {
+        // A value that does not begin a line may end in one more.
+        for offset in (0..size_of::<T>()).step_by(64).chain([size_of::<T>() - 1]) {
             // SAFETY: SSE is part of x86-64; a prefetch reads nothing, and the address lies within the value.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(address.add(64 * line)) };
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(address.add(offset)) };
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
