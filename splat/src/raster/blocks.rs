@@ -336,10 +336,8 @@ mod tests {
         for index in 0..gaussians.len() {
             // Standard deviations from 1e-4 to 1e4 of the scene, up to 1e8 apart in one Gaussian.
             let stretch = [index % 5, index / 5 % 5, index / 25 % 5].map(|place| 4.6 * (place as f32 - 2.0));
-            for axis in 0..3 {
-                gaussians.log_scales[index][axis] = stretch[axis];
-                gaussians.means[index][axis] *= [1.0, 3.0, 30.0][index % 3];
-            }
+            gaussians.log_scales[index] = stretch;
+            gaussians.means[index] = gaussians.means[index].map(|at| at * [1.0, 3.0, 30.0][index % 3]);
         }
         for (width, height) in [(1, 1), (17, 13), (64, 48), (70, 45)] {
             for instructions in Instructions::available() {

@@ -317,7 +317,7 @@ fn a_pixel_stops_before_the_footprint_that_would_leave_less_than_the_least() {
 #[test]
 fn frozen_gaussians_leave_the_gradients_of_the_others_as_they_are() {
     let (gaussians, camera) = (blobs(200, 51), &arc(3, 70, 45)[2]);
-    let frozen = |index: usize| index % 3 == 0;
+    let frozen = |index: usize| index.is_multiple_of(3);
     let seeds = seeds(3 * 70 * 45);
     let gradients = |active: &[bool]| {
         let mut pass = Pass::default();
