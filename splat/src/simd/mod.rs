@@ -88,17 +88,17 @@ pub(crate) trait Simd: Copy {
     }
 }
 
-/// Asks for the memory of a value, of at least a byte, that will be read soon.
+/// Asks for the memory of a value that will be read soon.
 #[inline(always)]
 pub(crate) fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         let address = std::ptr::from_ref(value).cast::<i8>();
-        // A value that does not begin a line may end in one more.
-        for offset in (0..size_of::<T>()).step_by(64).chain([size_of::<T>() - 1]) {
+        // Asking for one more line, in which a value may end that does not begin one, costs more than it gives.
+        for line in 0..size_of::<T>().div_ceil(64) {
             // SAFETY: SSE is part of x86-64; a prefetch reads nothing, and the address lies within the value.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(address.add(offset)) };
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(address.add(64 * line)) };
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
