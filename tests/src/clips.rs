@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use tempfile::TempDir;
+
 /// Copies the bundled clip's first `frames` frames of its first `views` training views and one test view to `target`.
 ///
 /// # Panics
@@ -31,6 +33,16 @@ pub fn copy(target: &Path, frames: u32, views: usize) {
         copy_file(&source, target, &format!("flow/{camera}.npz"));
     }
     copy_file(&source, target, "points3D.ply");
+}
+
+/// [`copy`] into a folder of its own, which lives as long as the result.
+///
+/// # Panics
+/// If the file system refuses.
+pub fn scratch(frames: u32, views: usize) -> TempDir {
+    let folder = tempfile::tempdir().expect("a scratch folder");
+    copy(folder.path(), frames, views);
+    folder
 }
 
 fn copy_file(source: &Path, target: &Path, name: &str) {

@@ -33,12 +33,7 @@ const SLOW: [&str; 8] = [
 
 fn clip() -> &'static Path {
     static CLIP: OnceLock<TempDir> = OnceLock::new();
-    CLIP.get_or_init(|| {
-        let folder = tempfile::tempdir().unwrap();
-        clips::copy(folder.path(), 2, 3);
-        folder
-    })
-    .path()
+    CLIP.get_or_init(|| clips::scratch(2, 3)).path()
 }
 
 /// A coordinator with an empty state, and what is said to it.

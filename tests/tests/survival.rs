@@ -38,12 +38,7 @@ const SETTINGS: [&str; 13] = [
 
 fn clip() -> &'static Path {
     static CLIP: OnceLock<TempDir> = OnceLock::new();
-    CLIP.get_or_init(|| {
-        let folder = tempfile::tempdir().unwrap();
-        clips::copy(folder.path(), 4, 4);
-        folder
-    })
-    .path()
+    CLIP.get_or_init(|| clips::scratch(4, 4)).path()
 }
 
 fn arguments(output: &Path, workers: usize) -> Vec<String> {

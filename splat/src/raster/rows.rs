@@ -17,7 +17,7 @@ pub(super) struct Span {
     pub curvature: f32,
 }
 
-/// The columns of image row `row` on which the footprint's alpha can reach [`ALPHA_MIN`].
+/// The columns of image row `row` on which the footprint's alpha can reach [`super::ALPHA_MIN`].
 #[inline(always)]
 pub(super) fn span(footprint: &Footprint, row: usize, width: usize) -> Option<Span> {
     let dy = row as f64 + 0.5 - footprint.mean[1];
