@@ -19,6 +19,7 @@ use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{Blob, Failure, FailureKind, FrameJob, StageSeconds, Success, report};
 
 use crate::{
+    ahead::Ahead,
     blobs::Blobs,
     connection::backoff,
     inputs::{self, InputCache},
@@ -53,7 +54,8 @@ impl JobError {
 pub(crate) struct JobRunner {
     pub(crate) reconstruct: Reconstruct,
     pub(crate) pool: Arc<rayon::ThreadPool>,
-    pub(crate) cache: InputCache,
+    pub(crate) cache: Arc<InputCache>,
+    pub(crate) ahead: Ahead,
     /// How long a transfer is tried again before the job fails as transient.
     pub(crate) patience: Duration,
     /// Seed of the jitter between those tries.
@@ -64,15 +66,16 @@ pub(crate) struct JobRunner {
 pub(crate) type Outcome = report::Outcome;
 
 impl JobRunner {
-    /// Runs one frame job to its report; `None` if it was cancelled.
+    /// Runs one frame job to its report; `None` if it was cancelled. The inputs of `likely_next` are loaded meanwhile.
     pub(crate) async fn run(
         &self,
         job: &FrameJob,
+        likely_next: Option<FrameJob>,
         blobs: &Blobs,
         progress: watch::Sender<FrameProgress>,
         cancel: &CancellationToken,
     ) -> Option<Outcome> {
-        match self.attempt(job, blobs, progress, cancel).await {
+        match self.attempt(job, likely_next, blobs, progress, cancel).await {
             Ok(Some(success)) => Some(Outcome::Success(success)),
             Ok(None) => None,
             Err(error) => Some(Outcome::Failure(Failure { kind: error.kind.into(), message: error.message })),
@@ -82,13 +85,17 @@ impl JobRunner {
     async fn attempt(
         &self,
         job: &FrameJob,
+        likely_next: Option<FrameJob>,
         blobs: &Blobs,
         progress: watch::Sender<FrameProgress>,
         cancel: &CancellationToken,
     ) -> Result<Option<Success>, JobError> {
         let mut stages = StageClock::start("fetch");
-        let fetch = retried(|| inputs::load(job, blobs, &self.cache), self.patience, self.jitter_seed);
+        let fetch = self.load(job, blobs);
         let Some(input) = cancel.run_until_cancelled(fetch).await.transpose()? else { return Ok(None) };
+        if let Some(next) = likely_next {
+            self.ahead.begin(next, blobs.clone(), self.cache.clone());
+        }
         let static_digest = static_digest(job)?;
         let Some((delta, report)) = self.compute(input, static_digest, progress, cancel, &mut stages).await?
         else {
@@ -100,6 +107,13 @@ impl JobRunner {
         let report_json = serde_json::to_string(&report)
             .map_err(|error| JobError::new(FailureKind::Bug, format!("the frame's report: {error}")))?;
         Ok(Some(Success { delta: Some(delta), report_json, seconds: stages.finish() }))
+    }
+
+    async fn load(&self, job: &FrameJob, blobs: &Blobs) -> Result<FrameInput, JobError> {
+        if let Some(input) = self.ahead.take(job).await {
+            return Ok(input);
+        }
+        retried(|| inputs::load(job, blobs, &self.cache), self.patience, self.jitter_seed).await
     }
 
     /// The CPU work, on a blocking thread inside the worker's pool, so that heartbeats go on. `None`: cancelled.

@@ -5,9 +5,11 @@
 //! | `run.rs` | what a worker does with each message, from registration to dismissal |
 //! | `connection.rs` | one bidirectional stream to the coordinator, and getting it back |
 //! | `job.rs` | a frame job from the wire to a report |
+//! | `ahead.rs` | the next frame's inputs, loaded while the present one is computed |
 //! | `inputs.rs` | checked conversion of a frame job's blobs to what `splat` takes |
 //! | `blobs.rs` | verified bulk, from the store's directory or through the coordinator |
 
+mod ahead;
 mod blobs;
 mod connection;
 mod inputs;

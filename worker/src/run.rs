@@ -26,9 +26,9 @@ use trackersplat_proto::{
 };
 
 use crate::{
+    ahead::Ahead,
     blobs::Blobs,
     connection::{self, Connection, ConnectionError},
-    inputs::InputCache,
     job::{JobRunner, Outcome, Reconstruct},
 };
 
@@ -212,7 +212,8 @@ impl Worker {
         let runner = Arc::new(JobRunner {
             reconstruct,
             pool: Arc::new(pool),
-            cache: InputCache::default(),
+            cache: Arc::default(),
+            ahead: Ahead::default(),
             patience: options.reconnect_for,
             jitter_seed,
         });
@@ -306,7 +307,7 @@ impl Worker {
 
     /// Begins a lease. One at a time: a lease that comes while a frame runs is left to expire.
     fn start(&mut self, lease: Lease, blobs: &Blobs) {
-        let Lease { lease_id, attempt, job } = lease;
+        let Lease { lease_id, attempt, job, likely_next } = lease;
         if let Some(running) = &self.running {
             tracing::warn!(
                 lease_id,
@@ -320,7 +321,8 @@ impl Worker {
         let cancel = CancellationToken::new();
         let (sender, progress) = watch::channel(FrameProgress { stage: "fetch", done: 0, total: 0 });
         let (runner, blobs, job_cancel) = (self.runner.clone(), blobs.clone(), cancel.clone());
-        let task = tokio::spawn(async move { runner.run(&job, &blobs, sender, &job_cancel).await });
+        let task =
+            tokio::spawn(async move { runner.run(&job, likely_next, &blobs, sender, &job_cancel).await });
         self.running = Some(RunningLease { lease_id, attempt, progress, cancel, task });
     }
 

@@ -6,14 +6,14 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use trackersplat_proto::v1::{
-    CancelLease, CoordinatorMessage, FailureKind, Heartbeat, Lease as LeaseMessage, Progress, Register,
-    coordinator_message::Message, job_event::Event,
+    CancelLease, CoordinatorMessage, FailureKind, FrameJob, Heartbeat, Lease as LeaseMessage, Progress,
+    Register, coordinator_message::Message, job_event::Event,
 };
 
 use super::{Desk, Hub, Notice};
 use crate::{
     failure::failure,
-    queue::{Connected, FailedLease, Lease, SessionId, frame::FrameState},
+    queue::{Connected, FailedLease, FrameKey, Lease, SessionId, frame::FrameState},
     store::{AttemptOutcome, FrameEvent, StoreError},
 };
 
@@ -194,15 +194,24 @@ impl Hub {
         change.append_frame_event(&key.job, FrameState::Leased, &event).await?;
         change.commit().await?;
         self.tell_stored(&key.job);
+        let job = Some(self.frame_job(key).await?);
+        let likely_next = match desk.queue.likely_next(worker_id) {
+            Some(next) => Some(self.frame_job(next).await?),
+            None => None,
+        };
+        tracing::info!(job_id = %key.job, frame = key.frame, attempt, worker_id, lease_id = id, "frame leased");
+        let message = LeaseMessage { lease_id: id.clone(), attempt: *attempt, job, likely_next };
+        desk.send(*session, Message::Lease(message));
+        Ok(())
+    }
+
+    async fn frame_job(&self, key: &FrameKey) -> Result<FrameJob, StoreError> {
         let record = self.store.frame(&key.job, key.frame).await?;
-        let job = record.ok_or_else(|| StoreError::Value {
+        let record = record.ok_or_else(|| StoreError::Value {
             place: "frames",
             value: format!("no row for frame {} of job {}", key.frame, key.job),
         })?;
-        tracing::info!(job_id = %key.job, frame = key.frame, attempt, worker_id, lease_id = id, "frame leased");
-        let message = LeaseMessage { lease_id: id.clone(), attempt: *attempt, job: Some(job.request()?) };
-        desk.send(*session, Message::Lease(message));
-        Ok(())
+        record.request()
     }
 }
 

@@ -272,6 +272,13 @@ impl Queue {
         Some(lease)
     }
 
+    /// What a worker that was just given a lease will likely be given next: those with older leases ask before it does.
+    pub fn likely_next(&self, worker_id: &str) -> Option<&FrameKey> {
+        let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());
+        let others = self.leases.values().filter(|lease| lease.worker_id != worker_id).count();
+        ready.filter(|(_, frame)| self.may_take(frame, worker_id)).nth(others).map(|(key, _)| key)
+    }
+
     /// Whether a worker may take a frame: never if it lacks the resources; if it was lost with the frame before, only
     /// while no other worker could take it.
     fn may_take(&self, frame: &OpenFrame, worker_id: &str) -> bool {

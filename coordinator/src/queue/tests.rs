@@ -68,6 +68,21 @@ fn key(frame: u32) -> FrameKey {
 }
 
 #[test]
+fn those_who_began_earlier_will_ask_earlier() {
+    let mut bench = Bench::new(1..=5);
+    let next = |bench: &Bench, worker| bench.queue.likely_next(worker).map(|key| key.frame);
+    bench.connect(1, "one");
+    bench.assign_one();
+    assert_eq!(next(&bench, "one"), Some(2), "nobody else works");
+    bench.connect(2, "two");
+    bench.assign_one();
+    assert_eq!(next(&bench, "two"), Some(4), "worker one takes frame 3 before");
+    bench.connect(3, "three");
+    bench.assign_one();
+    assert_eq!(next(&bench, "three"), None, "the others take what is left");
+}
+
+#[test]
 fn frames_go_out_in_order_to_the_worker_that_asked_first() {
     let mut bench = Bench::new([3, 1, 2]);
     let late = SessionId(1);
