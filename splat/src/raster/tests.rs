@@ -326,7 +326,7 @@ fn frozen_gaussians_leave_the_gradients_of_the_others_as_they_are() {
         pass.project(&gaussians, camera, degree);
         pass.bin(camera, &mut Vec::new());
         pass.blend(camera, BLACK, active, &mut image, &mut []);
-        pass.blend_backward(BLACK, &seeds, &[]);
+        pass.blend_backward(camera, BLACK, &seeds, &[]);
         let mut gradients = GaussianGradients::zeros(&gaussians);
         pass.project_backward(&gaussians, camera, degree, active, &mut gradients);
         gradients

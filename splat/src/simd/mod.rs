@@ -49,6 +49,8 @@ pub(crate) trait Simd: Copy {
     fn store_integers(self, to: &mut [i32; LANES]);
     /// `self * factor + term`, rounded once where the instruction set can.
     fn mul_add(self, factor: Self, term: Self) -> Self;
+    /// `term - self * factor`, rounded once where the instruction set can.
+    fn negated_mul_add(self, factor: Self, term: Self) -> Self;
     /// The larger; `other` where `self` is NaN.
     fn max(self, other: Self) -> Self;
     /// The smaller; `other` where `self` is NaN.
@@ -66,6 +68,15 @@ pub(crate) trait Simd: Copy {
     fn transpose(arguments: [Self; ROWS]) -> [Self; ROWS];
     /// In each row, the sum of that row of each argument, taken as `(0 + 2) + (1 + 3)`.
     fn row_sums(arguments: [Self; ROWS]) -> Self;
+
+    /// Each argument a row.
+    fn load_rows(rows: [&[f32; ROWS]; ROWS]) -> Self;
+    /// Lane `COLUMN` of each row in all lanes of the row.
+    fn spread_in_rows<const COLUMN: usize>(self) -> Self;
+
+    /// Writes the numbers from `first` on of those `words` that have one of the bits of `mask`, ascending, and returns
+    /// how many. The rest of `to` is overwritten with anything.
+    fn positions(words: &[u32; LANES], mask: u32, first: u32, to: &mut [u32; LANES]) -> usize;
 
     /// `2^x` for `x ≤ 127`, relative error below 2.5e-7 for `x ≥ -126`; smaller and NaN arguments give `2^-126`.
     ///
@@ -114,7 +125,7 @@ macro_rules! simd_kernel {
             #[cfg(target_arch = "x86_64")]
             {
                 use $crate::simd::{Avx2, Avx512, InstructionSet};
-                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,popcnt")]
                 fn avx512($($argument: $type),*) {
                     $kernel::<Avx512>($($argument),*);
                 }
