@@ -1,7 +1,7 @@
 //! Stage 3: front-to-back blending of a band's footprints, round by round, tile by tile and block by block.
 
 use super::{
-    ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
+    TRANSMITTANCE_MIN,
     blend_backward::Replayed,
     blocks::{BLOCKS, BandView, TileLists},
     tile::{Offsets, Seen, Tile},
@@ -66,13 +66,12 @@ impl<S: Simd> Open<S> {
         S::select(self.running.ge(S::splat(TRANSMITTANCE_MIN)), self.transmittance, stopped).store(to);
     }
 
-    /// Lets through a footprint of `alpha`; returns its weight, and where it is blended.
+    /// Lets through a footprint of `alpha`; returns its weight, and where it may have one.
     #[inline(always)]
     pub(super) fn pass(&mut self, alpha: S) -> (S, S::Mask) {
-        let live = alpha.ge(S::splat(ALPHA_MIN));
         let before = self.running;
-        self.running = S::select(live, before.negated_mul_add(alpha, before), before);
-        let blends = S::both(live, self.running.ge(S::splat(TRANSMITTANCE_MIN)));
+        self.running = before.negated_mul_add(alpha, before);
+        let blends = self.running.ge(S::splat(TRANSMITTANCE_MIN));
         self.transmittance = S::select(blends, self.running, self.transmittance);
         (S::select(blends, before.mul(alpha), S::splat(0.0)), blends)
     }
@@ -213,7 +212,7 @@ fn blend_list<S: Simd>(
             break;
         }
         for (alpha, &place) in alphas.iter_mut().zip(batch) {
-            *alpha = seen[place as usize].alpha::<S>(offsets).min(S::splat(ALPHA_MAX));
+            *alpha = seen[place as usize].alpha(offsets);
         }
         for (&alpha, &place) in alphas.iter().zip(batch) {
             let (weight, _) = open.pass(alpha);

@@ -117,13 +117,20 @@ fn backward_kernel<S: Simd>(
             }
             let sums = &mut band.sums[first..];
             for (listed, of_tile) in band.lists.of(tile).iter().zip(&replayed.sums) {
-                for (sum, value) in sums[listed.place()].iter_mut().zip(of_tile) {
-                    *sum += value;
-                }
+                add(&mut sums[listed.place()], of_tile);
             }
         }
     }
     band.replayed = replayed;
+}
+
+#[inline(always)]
+fn add(sums: &mut Sums, values: &Sums) {
+    let mut total = *sums;
+    for place in 0..total.len() {
+        total[place] += values[place];
+    }
+    *sums = total;
 }
 
 /// What a block's replay starts from.
@@ -204,7 +211,7 @@ impl Replayed {
                 break;
             }
             for (blended, &place) in blended.iter_mut().zip(places) {
-                let alpha = seen[place as usize].alpha::<S>(&offsets).min(S::splat(ALPHA_MAX));
+                let alpha = seen[place as usize].alpha(&offsets);
                 let (weight, blends) = open.pass(alpha);
                 S::select(blends, alpha, S::splat(0.0)).store(&mut blended.alpha.0);
                 weight.store(&mut blended.weight.0);
@@ -218,7 +225,7 @@ impl Replayed {
     /// returns where it begins.
     #[inline(always)]
     fn backwards<S: Simd>(&mut self, seen: &[Seen], list: &[u32], g: &[S; 3], behind: &mut S) -> usize {
-        let zero = S::splat(0.0);
+        let (zero, one) = (S::splat(0.0), S::splat(1.0));
         let mut first = list.len();
         for (place, &number) in list.iter().enumerate().rev() {
             let blended = &self.blended[place];
@@ -228,7 +235,8 @@ impl Replayed {
             let light = S::splat(blue).mul(g[2]);
             let light = S::splat(red).mul_add(g[0], S::splat(green).mul_add(g[1], light));
             let excess = light.sub(*behind);
-            *behind = alpha.mul_add(excess, *behind);
+            // The one operation that waits for the footprint behind.
+            *behind = one.sub(alpha).mul_add(*behind, alpha.mul(light));
             if !seen.is_active {
                 continue;
             }
@@ -237,7 +245,9 @@ impl Replayed {
             first -= 1;
             let share = &mut self.blended[first];
             v.store(&mut share.alpha.0);
-            weight.store(&mut share.weight.0);
+            if first != place {
+                weight.store(&mut share.weight.0);
+            }
             self.places[first] = number;
         }
         for place in list.len()..list.len() + ROWS {

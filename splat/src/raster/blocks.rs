@@ -447,4 +447,31 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn a_round_holds_no_more_than_its_limit_and_a_row_of_four_giants() {
+        let camera = &arc(1, 320, 48)[0];
+        let mut gaussians = blobs(1000, 7);
+        gaussians.log_scales.fill([3.0; 3]);
+        gaussians.logit_opacities.fill(0.0);
+        let mut bins = Bins::default();
+        project(Instructions::detect(), &gaussians, camera, 0, &mut bins.projection);
+        bins.sort(camera.height, &mut Vec::new());
+        let limit = RoundLimit { footprints: 300, places: 500 };
+        let view = BandView { bins: &bins, number: 1, width: 320, height: 48, active: &[], limit };
+        assert!(view.footprints() * view.tiles() > 19_000, "all of them reach all tiles");
+        let mut lists = TileLists::default();
+        let mut first = 0;
+        while first < view.footprints() {
+            fill(Instructions::detect(), &mut lists, &view, first);
+            assert!(!lists.entries.is_empty() && lists.entries.len() <= limit.footprints);
+            assert!(lists.listed.len() < limit.places + ROWS * view.tiles(), "{}", lists.listed.len());
+            for (place, entry) in lists.entries.iter().enumerate() {
+                let index = bins.band(1)[first + place] as usize;
+                assert_eq!(entry.mean, bins.projection.footprints[index].mean, "none is left out");
+            }
+            first += lists.entries.len();
+        }
+        assert_eq!(first, view.footprints());
+    }
 }

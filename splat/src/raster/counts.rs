@@ -5,7 +5,7 @@ use std::ops::Add;
 use rayon::prelude::*;
 
 use super::{
-    ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
+    TRANSMITTANCE_MIN,
     bin::{BAND_ROWS, Bins},
     blend::BATCH,
     blocks::{BLOCKS, BandView, RoundLimit, TileLists, fill},
@@ -137,11 +137,11 @@ fn count_block(tile: &mut Tile, block: usize, open: &mut OpenPixels) -> PairCoun
             break;
         }
         let mut alphas = [0.0; LANES];
-        tile.seen[seen as usize].alpha::<Plain>(&offsets).store(&mut alphas);
+        tile.seen[seen as usize].alpha(&offsets).store(&mut alphas);
         let mut is_live = false;
-        for (pixel, alpha) in open.iter_mut().zip(alphas.map(|alpha| alpha.min(ALPHA_MAX))) {
+        for (pixel, alpha) in open.iter_mut().zip(alphas) {
             let Some(before) = *pixel else { continue };
-            if !(alpha >= ALPHA_MIN) {
+            if alpha == 0.0 {
                 continue;
             }
             is_live = true;
@@ -162,7 +162,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        raster::LOW_PASS,
+        raster::{ALPHA_MAX, ALPHA_MIN, LOW_PASS},
         testing::{arc, blobs, on_threads},
     };
 

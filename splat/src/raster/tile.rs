@@ -1,10 +1,16 @@
 //! The footprints of one tile, close together in memory, and which of them each of its blocks sees.
 
-use super::blocks::{Entry, Listed, TILE, TileLists, corner};
+use super::{
+    ALPHA_MAX,
+    blocks::{Entry, Listed, TILE, TileLists, corner},
+};
 use crate::simd::{LANES, ROWS, Simd, prefetch};
 
+/// Logarithm to base 2 of [`super::ALPHA_MIN`]: thresholds in the exponent are those of the power.
+const LOG2_ALPHA_MIN: f32 = -7.994_353_4;
+
 /// Listed footprints whose memory is asked for ahead.
-const AHEAD: usize = 8;
+const AHEAD: usize = 16;
 
 /// Column and row of each lane within a block.
 pub(super) const COLUMNS: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
@@ -45,14 +51,17 @@ impl Seen {
         }
     }
 
-    /// Alpha of a block's pixels before the clamp.
+    /// Alpha of a block's pixels; zero where it is less than the least that is seen.
     #[inline(always)]
     pub(super) fn alpha<S: Simd>(&self, at: &Offsets<S>) -> S {
         let [d, dy, slope, curvature] = self.frame;
         let d = at.y.mul_add(S::splat(slope), at.x.add(S::splat(d)));
         let dy = at.y.add(S::splat(dy));
         let across = dy.mul(S::splat(self.fall)).mul_add(dy, S::splat(self.peak));
-        d.mul(S::splat(curvature)).mul_add(d, across).exp2()
+        let exponent = d.mul(S::splat(curvature)).mul_add(d, across);
+        // The power of what lies far below the threshold may be anything.
+        let is_seen = exponent.ge(S::splat(LOG2_ALPHA_MIN));
+        S::select(is_seen, exponent.exp2().min(S::splat(ALPHA_MAX)), S::splat(0.0))
     }
 }
 
@@ -96,13 +105,12 @@ impl Tile {
     #[inline(always)]
     pub(super) fn gather(&mut self, lists: &TileLists, tile: usize, centre: [f64; 2]) {
         let list = lists.of(tile);
-        self.seen.clear();
-        self.seen.reserve(list.len());
-        for (place, listed) in list.iter().enumerate() {
+        self.seen.resize(list.len(), Seen::default());
+        for (place, (seen, listed)) in self.seen.iter_mut().zip(list).enumerate() {
             if let Some(later) = list.get(place + AHEAD) {
                 prefetch(&lists.entries[later.place()]);
             }
-            self.seen.push(Seen::new(&lists.entries[listed.place()], centre));
+            *seen = Seen::new(&lists.entries[listed.place()], centre);
         }
         self.words.clear();
         for group in list.chunks(LANES) {
