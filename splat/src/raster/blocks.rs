@@ -23,7 +23,7 @@ pub(super) const TILE: usize = BAND_ROWS;
 pub(super) const BLOCKS: usize = BLOCK_ROWS * BLOCK_ROWS;
 
 /// Groups of footprints whose memory is asked for ahead.
-const AHEAD: usize = 4;
+const AHEAD: usize = 8;
 
 const BLOCK_ROWS: usize = TILE / BLOCK;
 

@@ -10,7 +10,7 @@ use crate::simd::{LANES, ROWS, Simd, prefetch};
 const LOG2_ALPHA_MIN: f32 = -7.994_353_4;
 
 /// Listed footprints whose memory is asked for ahead.
-const AHEAD: usize = 16;
+const AHEAD: usize = 32;
 
 /// Column and row of each lane within a block.
 pub(super) const COLUMNS: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
