@@ -93,7 +93,7 @@ impl Stages {
 
     /// Gradients of the footprints.
     pub(crate) fn blend_backward(&mut self) {
-        self.pass.blend_backward(BACKGROUND, &self.image_gradient, &[]);
+        self.pass.blend_backward(&self.scene.camera, BACKGROUND, &self.image_gradient, &[]);
     }
 
     /// Gradients of the parameters.

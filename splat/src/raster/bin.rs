@@ -1,9 +1,13 @@
 //! Stage 2: depth order, and which footprints each band of rows sees.
 
 use super::{depth_order::DepthOrder, project::Projection};
+use crate::simd::prefetch;
 
 /// Rows per band: the unit of parallel work, independent of the number of threads.
 pub(super) const BAND_ROWS: usize = 16;
+
+/// Gaussians whose memory is asked for ahead: depth order is no order in memory.
+const AHEAD: usize = 16;
 
 /// Footprints of a view and, per band, those that touch it in depth order.
 #[derive(Clone, Debug, Default)]
@@ -11,14 +15,14 @@ pub(super) struct Bins {
     /// What [`Bins::sort`] sorts.
     pub projection: Projection,
     /// `entries[starts[b]..starts[b + 1]]` belong to band `b`.
-    starts: Vec<u32>,
+    starts: Vec<usize>,
     /// Gaussians, by depth within a band.
     entries: Vec<u32>,
     /// Where Gaussian `g` is among the entries of band `b`: `places[first_place[g] + b - first_band]`.
     places: Vec<u32>,
     /// First place per Gaussian, and the number of places at the end.
-    first_place: Vec<u32>,
-    next: Vec<u32>,
+    first_place: Vec<usize>,
+    next: Vec<usize>,
     depth_order: DepthOrder,
 }
 
@@ -30,12 +34,12 @@ impl Bins {
 
     /// Gaussians that touch a band, nearest first.
     pub(super) fn band(&self, band: usize) -> &[u32] {
-        &self.entries[self.starts[band] as usize..self.starts[band + 1] as usize]
+        &self.entries[self.starts[band]..self.starts[band + 1]]
     }
 
     /// The places of Gaussian `index` in the lists of the bands that it touches, and the first of these bands.
     pub(super) fn places_of(&self, index: usize) -> (usize, &[u32]) {
-        let places = self.first_place[index] as usize..self.first_place[index + 1] as usize;
+        let places = self.first_place[index]..self.first_place[index + 1];
         (self.projection.bands[index].first as usize, &self.places[places])
     }
 
@@ -54,7 +58,7 @@ impl Bins {
         let mut places = 0;
         for range in &self.projection.bands {
             self.first_place.push(places);
-            places += range.end - range.first;
+            places += (range.end - range.first) as usize;
             for band in range.first..range.end {
                 self.starts[band as usize + 1] += 1;
             }
@@ -63,17 +67,22 @@ impl Bins {
         for band in 0..bands {
             self.starts[band + 1] += self.starts[band];
         }
-        self.entries.resize(places as usize, 0);
-        self.places.resize(places as usize, 0);
+        self.entries.resize(places, 0);
+        self.places.resize(places, 0);
         self.next.clone_from(&self.starts);
-        for &index in order {
+        for (number, &index) in order.iter().enumerate() {
+            if let Some(&later) = order.get(number + AHEAD) {
+                prefetch(&self.projection.bands[later as usize]);
+                prefetch(&self.first_place[later as usize]);
+            }
             let range = self.projection.bands[index as usize];
             let first_place = self.first_place[index as usize];
             for band in range.first..range.end {
                 let next = &mut self.next[band as usize];
-                self.entries[*next as usize] = index;
-                let place = *next - self.starts[band as usize];
-                self.places[(first_place + band - range.first) as usize] = place;
+                self.entries[*next] = index;
+                // Fits, as no band has more places than there are Gaussians.
+                let place = (*next - self.starts[band as usize]) as u32;
+                self.places[first_place + (band - range.first) as usize] = place;
                 *next += 1;
             }
         }

@@ -1,29 +1,25 @@
-//! Stage 3: front-to-back blending of a band's footprints, block by block.
+//! Stage 3: front-to-back blending of a band's footprints, round by round, tile by tile and block by block.
 
 use super::{
-    ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
-    bin::{BAND_ROWS, Bins},
-    blend_backward::Blended,
-    blocks::{BLOCK, BlockLists, Entry, corner, fill},
+    TRANSMITTANCE_MIN,
+    blend_backward::Replayed,
+    blocks::{BLOCKS, BandView, TileLists},
+    tile::{Offsets, Seen, Tile},
 };
-use crate::simd::{Instructions, LANES, Simd, prefetch, simd_kernel};
+use crate::simd::{LANES, Simd, simd_kernel};
 
 /// What a band of rows of the image holds while a view is rendered and its gradient is taken.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Band {
-    pub lists: BlockLists,
-    /// First image row.
-    pub first_row: usize,
-    /// Rows of the image in the band.
-    pub rows: usize,
-    /// Columns of the image.
-    pub width: usize,
-    /// Per block and pixel, how many footprints of the block's list came before blending stopped.
-    /// Single precision counts exactly to 2²⁴.
-    pub last: Vec<[f32; LANES]>,
-    /// What the list of the block at hand did, while it is replayed.
-    pub blended: Vec<Blended>,
-    /// Per entry of the lists, the gradient's sums.
+    /// Those of the round at hand.
+    pub lists: TileLists,
+    /// Where each round begins among the band's footprints.
+    pub rounds: Vec<usize>,
+    /// Per round but the first, block and pixel, the transmittance it starts with, see [`Open`].
+    carried: Vec<[f32; LANES]>,
+    pub tile: Tile,
+    pub replayed: Replayed,
+    /// Per footprint of the band, the gradient's sums.
     pub sums: Vec<Sums>,
 }
 
@@ -32,31 +28,15 @@ pub(super) struct Band {
 pub(super) type Sums = [f32; 12];
 
 impl Band {
-    /// Prepares band `number` of a `width × height` image: lists its footprints per block.
-    pub(super) fn reset(
-        &mut self,
-        instructions: Instructions,
-        bins: &Bins,
-        number: usize,
-        width: usize,
-        height: usize,
-        active: &[bool],
-    ) {
-        self.first_row = number * BAND_ROWS;
-        self.rows = BAND_ROWS.min(height - self.first_row);
-        self.width = width;
-        fill(instructions, &mut self.lists, bins, number, width, height, active);
-        // Every block writes all of its values.
-        self.last.resize(self.lists.blocks(), [0.0; LANES]);
-    }
-
-    /// Lane and place within the band of each of a block's pixels that lie in the image.
-    pub(super) fn pixels(&self, block: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
-        let (column, row) = corner(block);
-        let (width, columns) = (self.width, BLOCK.min(self.width.saturating_sub(column)));
-        let rows = BLOCK.min(self.rows.saturating_sub(row));
-        (0..rows)
-            .flat_map(move |y| (0..columns).map(move |x| (y * BLOCK + x, (row + y) * width + column + x)))
+    /// The transmittances with which a block starts a round.
+    #[inline(always)]
+    pub(super) fn start(&self, view: &BandView<'_>, round: usize, tile: usize, block: usize) -> [f32; LANES] {
+        if round > 0 {
+            return self.carried[((round - 1) * view.tiles() + tile) * BLOCKS + block];
+        }
+        let mut start = [0.0; LANES];
+        view.pixels(tile, block).for_each(|(lane, _)| start[lane] = 1.0);
+        start
     }
 }
 
@@ -64,126 +44,182 @@ impl Band {
 /// does, and a processor overlaps the long chains of the former only if they stand close together.
 pub(super) const BATCH: usize = 16;
 
-/// Entries whose memory is asked for ahead: a block's list leaves out most of its band, so that no pattern shows.
-pub(super) const AHEAD: usize = 8;
-
-/// Column and row of each lane within a block.
-pub(super) const COLUMNS: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
-const ROWS: [f32; LANES] = [0., 0., 0., 0., 1., 1., 1., 1., 2., 2., 2., 2., 3., 3., 3., 3.];
-
-/// A footprint seen from a block.
+/// Transmittance of a block's pixels, and which of them still blend. In memory, that of those which do not is negative.
 #[derive(Clone, Copy)]
-pub(super) struct Local {
-    /// Offset of the block's first pixel from the row centre of its row.
-    pub d: f32,
-    /// Offset of the block's first row from the mean.
-    pub dy: f32,
-    /// Row centre shift per row.
-    pub slope: f32,
+pub(super) struct Open<S> {
+    pub transmittance: S,
+    /// Goes on falling where blending has stopped, and never rises: blending has stopped wherever it is below the least.
+    running: S,
 }
 
-impl Local {
-    /// `x, y`: centre of the block's first pixel. In double precision, as a needle's row centre is a small difference
-    /// of large numbers.
+impl<S: Simd> Open<S> {
     #[inline(always)]
-    pub(super) fn new(entry: &Entry, x: f64, y: f64) -> Self {
-        let dy = y - entry.mean[1];
-        let d = (x - entry.mean[0]) - entry.slope * dy;
-        Self { d: d as f32, dy: dy as f32, slope: entry.slope as f32 }
+    pub(super) fn load(from: &[f32; LANES]) -> Self {
+        let (zero, stored) = (S::splat(0.0), S::load(from));
+        let running = stored.max(zero);
+        Self { transmittance: running.max(zero.sub(stored)), running }
     }
 
-    /// Alpha of the block's pixels before the clamp.
     #[inline(always)]
-    pub(super) fn alpha<S: Simd>(&self, entry: &Entry) -> S {
-        let d = S::load(&ROWS).mul_add(S::splat(-self.slope), S::load(&COLUMNS).add(S::splat(self.d)));
-        let dy = S::load(&ROWS).add(S::splat(self.dy));
-        let across = dy.mul(S::splat(-entry.fall)).mul_add(dy, S::splat(entry.peak));
-        d.mul(S::splat(-entry.curvature)).mul_add(d, across).exp2()
+    fn store(self, to: &mut [f32; LANES]) {
+        let stopped = S::splat(0.0).sub(self.transmittance);
+        S::select(self.running.ge(S::splat(TRANSMITTANCE_MIN)), self.transmittance, stopped).store(to);
+    }
+
+    /// Lets through a footprint of `alpha`; returns its weight, and where it may have one.
+    #[inline(always)]
+    pub(super) fn pass(&mut self, alpha: S) -> (S, S::Mask) {
+        let before = self.running;
+        self.running = before.negated_mul_add(alpha, before);
+        let blends = self.running.ge(S::splat(TRANSMITTANCE_MIN));
+        self.transmittance = S::select(blends, self.running, self.transmittance);
+        (S::select(blends, before.mul(alpha), S::splat(0.0)), blends)
+    }
+
+    #[inline(always)]
+    pub(super) fn is_any(self) -> bool {
+        S::any(self.running.ge(S::splat(TRANSMITTANCE_MIN)))
     }
 }
 
 simd_kernel! {
     /// Blends all footprints of a band front to back into `pixels`, the band's rows of the image, `rows × width × 3`,
     /// and `alpha`, `rows × width` or empty.
-    pub(super) fn blend(band: &mut Band, background: [f32; 3], pixels: &mut [f32], alpha: &mut [f32]) = blend_kernel
+    pub(super) fn blend(
+        band: &mut Band,
+        view: &BandView<'_>,
+        background: [f32; 3],
+        pixels: &mut [f32],
+        alpha: &mut [f32],
+    ) = blend_kernel
 }
 
 #[inline(always)]
-fn blend_kernel<S: Simd>(band: &mut Band, background: [f32; 3], pixels: &mut [f32], alpha: &mut [f32]) {
-    for block in 0..band.lists.blocks() {
-        let mut is_inside = [0.0; LANES];
-        band.pixels(block).for_each(|(lane, _)| is_inside[lane] = 1.0);
-        let (column, row) = corner(block);
-        let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
-        let blended = blend_block::<S>(&band.lists.entries, band.lists.of(block), x, y, &is_inside);
-        band.last[block] = blended.last;
-        for (lane, place) in band.pixels(block) {
-            let transmittance = blended.transmittance[lane];
-            for channel in 0..3 {
-                pixels[3 * place + channel] =
-                    blended.colour[channel][lane] + transmittance * background[channel];
-            }
-            if let Some(value) = alpha.get_mut(place) {
-                *value = 1.0 - transmittance;
-            }
-        }
-    }
-}
-
-struct BlockResult {
-    colour: [[f32; LANES]; 3],
-    transmittance: [f32; LANES],
-    last: [f32; LANES],
-}
-
-/// Blends the listed entries over one block; lanes that are not inside the image blend nothing.
-#[inline(always)]
-fn blend_block<S: Simd>(
-    entries: &[Entry],
-    list: &[u32],
-    x: f64,
-    y: f64,
-    is_inside: &[f32; LANES],
-) -> BlockResult {
-    let (zero, one, least) = (S::splat(0.0), S::splat(1.0), S::splat(TRANSMITTANCE_MIN));
-    // Goes on falling where blending has stopped, and never rises: blending has stopped wherever it is below the least.
-    let mut running = S::load(is_inside);
-    let mut transmittance = one;
-    let mut colour = [zero; 3];
-    let (mut place, mut last) = (zero, zero);
-    let mut alphas = [zero; BATCH];
-    for (number, batch) in list.chunks(BATCH).enumerate() {
-        for &later in list.iter().skip((number + 1) * BATCH).take(BATCH) {
-            prefetch(&entries[later as usize]);
-        }
-        for (alpha, &entry) in alphas.iter_mut().zip(batch) {
-            let entry = &entries[entry as usize];
-            let value = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
-            *alpha = S::select(value.ge(S::splat(ALPHA_MIN)), value, zero);
-        }
-        for (&alpha, &entry) in alphas.iter().zip(batch) {
-            let entry = &entries[entry as usize];
-            let weight = running.mul(alpha);
-            running = running.sub(weight);
-            let blends = running.ge(least);
-            transmittance = S::select(blends, running, transmittance);
-            place = place.add(one);
-            last = S::select(blends, place, last);
-            let weight = S::select(blends, weight, zero);
-            for channel in 0..3 {
-                colour[channel] = weight.mul_add(S::splat(entry.colour[channel]), colour[channel]);
-            }
-        }
-        if !S::any(running.ge(least)) {
+fn blend_kernel<S: Simd>(
+    band: &mut Band,
+    view: &BandView<'_>,
+    background: [f32; 3],
+    pixels: &mut [f32],
+    alpha: &mut [f32],
+) {
+    band.rounds.clear();
+    band.carried.clear();
+    let mut first = 0;
+    loop {
+        band.lists.fill::<S>(view, first);
+        band.rounds.push(first);
+        let end = first + band.lists.entries.len();
+        if end == view.footprints() {
             break;
         }
+        // With nothing left open, a last round of no footprints lets the background through.
+        let is_open = blend_round::<S>(band, view, pixels);
+        first = if is_open { end } else { view.footprints() };
     }
-    let mut blended =
-        BlockResult { colour: [[0.0; LANES]; 3], transmittance: [0.0; LANES], last: [0.0; LANES] };
-    for (values, to) in colour.into_iter().zip(&mut blended.colour) {
-        values.store(to);
+    finish::<S>(band, view, background, pixels, alpha);
+}
+
+/// A round that is not the last: colours are left in `pixels`, transmittances in `carried`. Returns whether any pixel is
+/// still open.
+#[inline(always)]
+fn blend_round<S: Simd>(band: &mut Band, view: &BandView<'_>, pixels: &mut [f32]) -> bool {
+    let mut is_open = false;
+    for tile in 0..view.tiles() {
+        band.tile.gather(&band.lists, tile, view.centre(tile));
+        for block in 0..BLOCKS {
+            let (open, colour) = blend_block::<S>(band, view, tile, block, pixels);
+            is_open |= open.is_any();
+            let mut carried = [0.0; LANES];
+            open.store(&mut carried);
+            band.carried.push(carried);
+            for (lane, place) in view.pixels(tile, block) {
+                for channel in 0..3 {
+                    pixels[3 * place + channel] = colour[channel][lane];
+                }
+            }
+        }
     }
-    transmittance.store(&mut blended.transmittance);
-    last.store(&mut blended.last);
-    blended
+    is_open
+}
+
+/// The last round.
+#[inline(always)]
+fn finish<S: Simd>(
+    band: &mut Band,
+    view: &BandView<'_>,
+    background: [f32; 3],
+    pixels: &mut [f32],
+    alpha: &mut [f32],
+) {
+    for tile in 0..view.tiles() {
+        band.tile.gather(&band.lists, tile, view.centre(tile));
+        for block in 0..BLOCKS {
+            let (open, colour) = blend_block::<S>(band, view, tile, block, pixels);
+            let mut left = [0.0; LANES];
+            open.transmittance.store(&mut left);
+            for (lane, place) in view.pixels(tile, block) {
+                for channel in 0..3 {
+                    pixels[3 * place + channel] = colour[channel][lane] + left[lane] * background[channel];
+                }
+                if let Some(value) = alpha.get_mut(place) {
+                    *value = 1.0 - left[lane];
+                }
+            }
+        }
+    }
+}
+
+/// Blends a block's footprints of the round at hand over what the rounds before left; lanes that are not inside the image
+/// blend nothing.
+#[inline(always)]
+fn blend_block<S: Simd>(
+    band: &mut Band,
+    view: &BandView<'_>,
+    tile: usize,
+    block: usize,
+    pixels: &[f32],
+) -> (Open<S>, [[f32; LANES]; 3]) {
+    let round = band.rounds.len() - 1;
+    let mut open = Open::<S>::load(&band.start(view, round, tile, block));
+    let mut colour = [[0.0; LANES]; 3];
+    if round > 0 {
+        for (lane, place) in view.pixels(tile, block) {
+            for channel in 0..3 {
+                colour[channel][lane] = pixels[3 * place + channel];
+            }
+        }
+    }
+    let mut light = [S::load(&colour[0]), S::load(&colour[1]), S::load(&colour[2])];
+    let count = band.tile.list::<S>(block);
+    blend_list::<S>(&band.tile.seen, band.tile.listed(count), &Offsets::new(block), &mut open, &mut light);
+    for channel in 0..3 {
+        light[channel].store(&mut colour[channel]);
+    }
+    (open, colour)
+}
+
+#[inline(always)]
+fn blend_list<S: Simd>(
+    seen: &[Seen],
+    list: &[u32],
+    offsets: &Offsets<S>,
+    open: &mut Open<S>,
+    light: &mut [S; 3],
+) {
+    let mut alphas = [S::splat(0.0); BATCH];
+    for batch in list.chunks(BATCH) {
+        if !open.is_any() {
+            break;
+        }
+        for (alpha, &place) in alphas.iter_mut().zip(batch) {
+            *alpha = seen[place as usize].alpha(offsets);
+        }
+        for (&alpha, &place) in alphas.iter().zip(batch) {
+            let (weight, _) = open.pass(alpha);
+            let [red, green, blue] = seen[place as usize].colour;
+            light[0] = weight.mul_add(S::splat(red), light[0]);
+            light[1] = weight.mul_add(S::splat(green), light[1]);
+            light[2] = weight.mul_add(S::splat(blue), light[2]);
+        }
+    }
 }

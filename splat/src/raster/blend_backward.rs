@@ -14,11 +14,12 @@
 //! It divides by nothing, so an opaque footprint is as safe as a faint one.
 
 use super::{
-    ALPHA_MAX, ALPHA_MIN,
-    blend::{AHEAD, Band, COLUMNS, Local, Sums},
-    blocks::{Entry, corner},
+    ALPHA_MAX,
+    blend::{Band, Open, Sums},
+    blocks::{BLOCKS, BandView},
+    tile::{COLUMNS, Offsets, Seen, first_offset},
 };
-use crate::simd::{Group, LANES, ROWS, Simd, prefetch, simd_kernel};
+use crate::simd::{Group, LANES, ROWS, Simd, simd_kernel};
 
 /// Gradient of the loss by one footprint.
 ///
@@ -64,6 +65,7 @@ simd_kernel! {
     /// out all the same.
     pub(super) fn blend_backward(
         band: &mut Band,
+        view: &BandView<'_>,
         background: [f32; 3],
         gradient: &[f32],
         alpha_gradient: &[f32],
@@ -71,183 +73,240 @@ simd_kernel! {
 }
 
 #[inline(always)]
-fn backward_kernel<S: Simd>(band: &mut Band, background: [f32; 3], gradient: &[f32], alpha_gradient: &[f32]) {
+fn backward_kernel<S: Simd>(
+    band: &mut Band,
+    view: &BandView<'_>,
+    background: [f32; 3],
+    gradient: &[f32],
+    alpha_gradient: &[f32],
+) {
     band.sums.clear();
-    band.sums.resize(band.lists.entries.len(), [0.0; 12]);
-    for block in 0..band.lists.blocks() {
-        let mut replay = Replay::default();
-        for (lane, place) in band.pixels(block) {
-            let mut from_background = -alpha_gradient.get(place).copied().unwrap_or(0.0);
-            for channel in 0..3 {
-                let gradient = gradient[3 * place + channel];
-                replay.colour_gradient[channel][lane] = gradient;
-                from_background += gradient * background[channel];
-            }
-            replay.behind[lane] = from_background;
+    band.sums.resize(view.footprints(), [0.0; 12]);
+    let mut replayed = std::mem::take(&mut band.replayed);
+    replayed.behind.clear();
+    replayed.behind.resize(view.tiles() * BLOCKS, [0.0; LANES]);
+    let rounds = band.rounds.len();
+    for round in (0..rounds).rev() {
+        let first = band.rounds[round];
+        if round + 1 < rounds {
+            band.lists.fill::<S>(view, first);
         }
-        let (column, row) = corner(block);
-        let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
-        let last = &band.last[block];
-        let deepest = last.iter().fold(0.0, |deepest: f32, &place| deepest.max(place)) as usize;
-        let list = &band.lists.of(block)[..deepest];
-        blend_again::<S>(&band.lists.entries, list, last, x, y, &mut band.blended);
-        replay_block::<S>(&band.lists.entries, list, x, y, &replay, &band.blended, &mut band.sums);
+        for tile in 0..view.tiles() {
+            band.tile.gather(&band.lists, tile, view.centre(tile));
+            replayed.sums.clear();
+            replayed.sums.resize(band.tile.seen.len(), [0.0; 12]);
+            for block in 0..BLOCKS {
+                let mut seeds = Seeds::default();
+                for (lane, place) in view.pixels(tile, block) {
+                    let mut from_background = -alpha_gradient.get(place).copied().unwrap_or(0.0);
+                    for channel in 0..3 {
+                        let gradient = gradient[3 * place + channel];
+                        seeds.colour_gradient[channel][lane] = gradient;
+                        from_background += gradient * background[channel];
+                    }
+                    seeds.behind[lane] = from_background;
+                }
+                let number = tile * BLOCKS + block;
+                if round + 1 < rounds {
+                    seeds.behind = replayed.behind[number];
+                }
+                let start = band.start(view, round, tile, block);
+                let count = band.tile.list::<S>(block);
+                let (seen, list) = (&band.tile.seen[..], band.tile.listed(count));
+                replayed.behind[number] = replayed.block::<S>(seen, list, block, &start, &seeds);
+            }
+            let sums = &mut band.sums[first..];
+            for (listed, of_tile) in band.lists.of(tile).iter().zip(&replayed.sums) {
+                add(&mut sums[listed.place()], of_tile);
+            }
+        }
     }
+    band.replayed = replayed;
+}
+
+#[inline(always)]
+fn add(sums: &mut Sums, values: &Sums) {
+    let mut total = *sums;
+    for place in 0..total.len() {
+        total[place] += values[place];
+    }
+    *sums = total;
 }
 
 /// What a block's replay starts from.
 #[derive(Default)]
-struct Replay {
+struct Seeds {
     colour_gradient: [[f32; LANES]; 3],
     behind: [f32; LANES],
 }
 
+/// Buffers of the replay.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Replayed {
+    /// Per footprint of the tile at hand.
+    sums: Vec<Sums>,
+    /// Of the block at hand, see [`Blended`].
+    blended: Vec<Blended>,
+    /// Which footprints of the tile `blended` are.
+    places: Vec<u32>,
+    /// Per block and pixel, the light behind the footprints that were replayed.
+    behind: Vec<[f32; LANES]>,
+}
+
 /// What one footprint did to a block's pixels; zero where it was not blended.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Blended {
+struct Blended {
+    /// On the way back `alpha · ∂loss/∂alpha` takes its place.
     alpha: Group,
     weight: Group,
 }
 
-/// Repeats the blending of a block's list.
-#[inline(always)]
-fn blend_again<S: Simd>(
-    entries: &[Entry],
-    list: &[u32],
-    last: &[f32; LANES],
-    x: f64,
-    y: f64,
-    blended: &mut Vec<Blended>,
-) {
-    blended.resize(list.len(), Blended::default());
-    let (zero, last) = (S::splat(0.0), S::load(last));
-    let mut transmittance = S::splat(1.0);
-    let mut place = zero;
-    for (place_in_list, (blended, &entry)) in blended.iter_mut().zip(list).enumerate() {
-        if let Some(&later) = list.get(place_in_list + AHEAD) {
-            prefetch(&entries[later as usize]);
+impl Replayed {
+    /// Replays a block and adds to the tile's sums; returns the light behind its first footprint.
+    #[inline(always)]
+    fn block<S: Simd>(
+        &mut self,
+        seen: &[Seen],
+        list: &[u32],
+        block: usize,
+        start: &[f32; LANES],
+        seeds: &Seeds,
+    ) -> [f32; LANES] {
+        let count = self.forwards::<S>(seen, list, block, start);
+        let [red, green, blue] = &seeds.colour_gradient;
+        let g = [S::load(red), S::load(green), S::load(blue)];
+        let mut behind = S::load(&seeds.behind);
+        let first = self.backwards(seen, &list[..count], &g, &mut behind);
+        let [red, green, blue] = g;
+        let rows = [S::transpose([red; ROWS]), S::transpose([green; ROWS]), S::transpose([blue; ROWS])];
+        for place in (first..count).step_by(ROWS) {
+            self.accumulate(seen, place, block, &rows);
         }
-        let entry = &entries[entry as usize];
-        let alpha = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
-        let was_blended = S::both(alpha.ge(S::splat(ALPHA_MIN)), place.lt(last));
-        let alpha = S::select(was_blended, alpha, zero);
-        let weight = transmittance.mul(alpha);
-        transmittance = transmittance.sub(weight);
-        place = place.add(S::splat(1.0));
-        alpha.store(&mut blended.alpha.0);
-        weight.store(&mut blended.weight.0);
+        let mut left = [0.0; LANES];
+        behind.store(&mut left);
+        left
     }
-}
 
-#[inline(always)]
-fn replay_block<S: Simd>(
-    entries: &[Entry],
-    list: &[u32],
-    x: f64,
-    y: f64,
-    replay: &Replay,
-    blended: &[Blended],
-    sums: &mut [Sums],
-) {
-    let zero = S::splat(0.0);
-    let [red, green, blue] = &replay.colour_gradient;
-    let g = [S::load(red), S::load(green), S::load(blue)];
-    let mut behind = S::load(&replay.behind);
-    let nothing = Share { entry: 0, weight: zero, v: zero };
-    let mut shares = [nothing; ROWS];
-    let mut count = 0;
-    for (place, (blended, &number)) in blended.iter().zip(list).enumerate().rev() {
-        if let Some(&later) = place.checked_sub(AHEAD).and_then(|place| list.get(place)) {
-            prefetch(&sums[later as usize]);
+    /// Repeats the blending of a block's list; returns how many of it come before all pixels have stopped.
+    #[inline(always)]
+    fn forwards<S: Simd>(
+        &mut self,
+        seen: &[Seen],
+        list: &[u32],
+        block: usize,
+        start: &[f32; LANES],
+    ) -> usize {
+        /// Footprints between two looks at whether any pixel is open.
+        const LOOK: usize = 8;
+        // Whole rows of four are summed up; those behind the last stay as they are and are cleared on the way back.
+        if self.blended.len() < list.len() + ROWS {
+            self.blended.resize(list.len() + ROWS, Blended::default());
+            self.places.resize(list.len() + ROWS, 0);
         }
-        let entry = &entries[number as usize];
-        let (alpha, weight) = (S::load(&blended.alpha.0), S::load(&blended.weight.0));
-        let [red, green, blue] = entry.colour;
-        let light = S::splat(blue).mul(g[2]);
-        let light = S::splat(red).mul_add(g[0], S::splat(green).mul_add(g[1], light));
-        let excess = light.sub(behind);
-        behind = alpha.mul_add(excess, behind);
-        if !entry.is_active {
-            continue;
+        let offsets = Offsets::new(block);
+        let mut open = Open::<S>::load(start);
+        let mut count = 0;
+        for (blended, places) in self.blended.chunks_mut(LOOK).zip(list.chunks(LOOK)) {
+            if !open.is_any() {
+                break;
+            }
+            for (blended, &place) in blended.iter_mut().zip(places) {
+                let alpha = seen[place as usize].alpha(&offsets);
+                let (weight, blends) = open.pass(alpha);
+                S::select(blends, alpha, S::splat(0.0)).store(&mut blended.alpha.0);
+                weight.store(&mut blended.weight.0);
+            }
+            count += places.len();
         }
-        // Where alpha was clamped it follows nothing.
-        let v = S::select(alpha.lt(S::splat(ALPHA_MAX)), weight.mul(excess), zero);
-        shares[count] = Share { entry: number, weight, v };
-        count += 1;
-        if count == ROWS {
-            accumulate::<S>(sums, entries, &shares, x, y, &g);
-            count = 0;
-        }
+        count
     }
-    if count > 0 {
-        for share in &mut shares[count..] {
-            *share = nothing;
-        }
-        accumulate::<S>(sums, entries, &shares, x, y, &g);
-    }
-}
 
-/// What one footprint gets from a block.
-#[derive(Clone, Copy)]
-struct Share<S> {
-    entry: u32,
-    weight: S,
-    /// `alpha · ∂loss/∂alpha`.
-    v: S,
-}
+    /// Goes through what was blended back to front, and leaves what active footprints get at the end of the buffers;
+    /// returns where it begins.
+    #[inline(always)]
+    fn backwards<S: Simd>(&mut self, seen: &[Seen], list: &[u32], g: &[S; 3], behind: &mut S) -> usize {
+        let (zero, one) = (S::splat(0.0), S::splat(1.0));
+        let mut first = list.len();
+        for (place, &number) in list.iter().enumerate().rev() {
+            let blended = &self.blended[place];
+            let (alpha, weight) = (S::load(&blended.alpha.0), S::load(&blended.weight.0));
+            let seen = &seen[number as usize];
+            let [red, green, blue] = seen.colour;
+            let light = S::splat(blue).mul(g[2]);
+            let light = S::splat(red).mul_add(g[0], S::splat(green).mul_add(g[1], light));
+            let excess = light.sub(*behind);
+            // The one operation that waits for the footprint behind.
+            *behind = one.sub(alpha).mul_add(*behind, alpha.mul(light));
+            if !seen.is_active {
+                continue;
+            }
+            // Where alpha was clamped it follows nothing.
+            let v = S::select(alpha.lt(S::splat(ALPHA_MAX)), weight.mul(excess), zero);
+            first -= 1;
+            let share = &mut self.blended[first];
+            v.store(&mut share.alpha.0);
+            if first != place {
+                weight.store(&mut share.weight.0);
+            }
+            self.places[first] = number;
+        }
+        for place in list.len()..list.len() + ROWS {
+            self.blended[place] = Blended::default();
+            self.places[place] = 0;
+        }
+        first
+    }
 
-/// Adds a block's shares to the sums of four entries, a row of lanes for each: first over the rows of the block, whose
-/// offsets are known, then over its columns.
-#[inline(always)]
-fn accumulate<S: Simd>(
-    sums: &mut [Sums],
-    entries: &[Entry],
-    shares: &[Share<S>; ROWS],
-    x: f64,
-    y: f64,
-    colour_gradient: &[S; 3],
-) {
-    // Per entry, the same in its four lanes, but for the column.
-    let (mut offset, mut dy, mut slope) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
-    for (row, share) in shares.iter().enumerate() {
-        let local = Local::new(&entries[share.entry as usize], x, y);
-        let lanes = ROWS * row..ROWS * (row + 1);
-        offset[lanes.clone()].fill(local.d);
-        dy[lanes.clone()].fill(local.dy);
-        slope[lanes].fill(-local.slope);
-    }
-    let (dy, against) = (S::load(&dy), S::load(&slope));
-    let across = S::load(&COLUMNS).add(S::load(&offset));
-    // Moments of v by the row within the block, per column.
-    let [a, b, c, d] = shares;
-    let [v0, v1, v2, v3] = S::transpose([a.v, b.v, c.v, d.v]);
-    let m0 = v0.add(v2).add(v1.add(v3));
-    let m1 = v3.mul_add(S::splat(3.0), v2.mul_add(S::splat(2.0), v1));
-    let m2 = v3.mul_add(S::splat(9.0), v2.mul_add(S::splat(4.0), v1));
-    // Of v by d and dy, with d = across - slope · row and dy = local.dy + row.
-    let v_d = m0.mul_add(across, m1.mul(against));
-    let v_d_row = m1.mul_add(across, m2.mul(against));
-    let v_dd = v_d.mul_add(across, v_d_row.mul(against));
-    let v_y = m0.mul_add(dy, m1);
-    let v_dy = v_d.mul_add(dy, v_d_row);
-    let v_y_row = m1.mul_add(dy, m2);
-    let v_yy = v_y.mul_add(dy, v_y_row);
-    let zero = S::splat(0.0);
-    let mut colour = [zero; 3];
-    for (sum, &g) in colour.iter_mut().zip(colour_gradient) {
-        let weighted = [a.weight.mul(g), b.weight.mul(g), c.weight.mul(g), d.weight.mul(g)];
-        let [w0, w1, w2, w3] = S::transpose(weighted);
-        *sum = w0.add(w2).add(w1.add(w3));
-    }
-    let [red, green, blue] = colour;
-    let parts = [[m0, v_d, v_dd, v_y], [v_dy, v_yy, red, green], [blue, zero, zero, zero]];
-    for (part, of_entries) in parts.into_iter().enumerate() {
-        let mut values = [0.0; LANES];
-        S::row_sums(of_entries).store(&mut values);
-        for (share, values) in shares.iter().zip(values.as_chunks::<ROWS>().0) {
-            let sums = &mut sums[share.entry as usize].as_chunks_mut::<ROWS>().0[part];
-            for (sum, value) in sums.iter_mut().zip(values) {
-                *sum += value;
+    /// Adds a block's shares to the sums of four footprints, a row of lanes for each: first over the rows of the block, whose
+    /// offsets are known, then over its columns.
+    #[inline(always)]
+    fn accumulate<S: Simd>(&mut self, seen: &[Seen], first: usize, block: usize, g: &[[S; ROWS]; 3]) {
+        let (Some([a, b, c, d]), Some(&places)) =
+            (self.blended[first..].first_chunk(), self.places[first..].first_chunk::<ROWS>())
+        else {
+            return;
+        };
+        let [i, j, k, l] = places;
+        let frame = |place: u32| &seen[place as usize].frame;
+        let frames = S::load_rows([frame(i), frame(j), frame(k), frame(l)]);
+        let [x, y] = first_offset(block);
+        // Per footprint, the same in its four lanes, but for the column.
+        let against = frames.spread_in_rows::<2>();
+        let dy = frames.spread_in_rows::<1>().add(S::splat(y));
+        let across = frames.spread_in_rows::<0>().add(S::load(&COLUMNS).add(S::splat(x)));
+        let across = against.mul_add(S::splat(y), across);
+        // Moments of v by the row within the block, per column.
+        let v = [S::load(&a.alpha.0), S::load(&b.alpha.0), S::load(&c.alpha.0), S::load(&d.alpha.0)];
+        let [v0, v1, v2, v3] = S::transpose(v);
+        let m0 = v0.add(v2).add(v1.add(v3));
+        let m1 = v3.mul_add(S::splat(3.0), v2.mul_add(S::splat(2.0), v1));
+        let m2 = v3.mul_add(S::splat(9.0), v2.mul_add(S::splat(4.0), v1));
+        // Of v by d and dy, with d = across - slope · row and dy that of the first row plus row.
+        let v_d = m0.mul_add(across, m1.mul(against));
+        let v_d_row = m1.mul_add(across, m2.mul(against));
+        let v_dd = v_d.mul_add(across, v_d_row.mul(against));
+        let v_y = m0.mul_add(dy, m1);
+        let v_dy = v_d.mul_add(dy, v_d_row);
+        let v_y_row = m1.mul_add(dy, m2);
+        let v_yy = v_y.mul_add(dy, v_y_row);
+        let weights =
+            [S::load(&a.weight.0), S::load(&b.weight.0), S::load(&c.weight.0), S::load(&d.weight.0)];
+        let [w0, w1, w2, w3] = S::transpose(weights);
+        let zero = S::splat(0.0);
+        let mut colour = [zero; 3];
+        for (sum, [g0, g1, g2, g3]) in colour.iter_mut().zip(g) {
+            *sum = w3.mul_add(*g3, w2.mul_add(*g2, w1.mul_add(*g1, w0.mul(*g0))));
+        }
+        let [red, green, blue] = colour;
+        let parts = [[m0, v_d, v_dd, v_y], [v_dy, v_yy, red, green], [blue, zero, zero, zero]];
+        for (part, of_footprints) in parts.into_iter().enumerate() {
+            let mut values = [0.0; LANES];
+            S::row_sums(of_footprints).store(&mut values);
+            for (&place, values) in places.iter().zip(values.as_chunks::<ROWS>().0) {
+                let sums = &mut self.sums[place as usize].as_chunks_mut::<ROWS>().0[part];
+                for (sum, value) in sums.iter_mut().zip(values) {
+                    *sum += value;
+                }
             }
         }
     }

@@ -1,7 +1,11 @@
-//! Which footprints each block of 4 × 4 pixels of a band sees.
+//! Which footprints each tile of 16 × 16 pixels of a band sees, and in which of its blocks of 4 × 4.
 //!
-//! Lists per block instead of per tile of 16 × 16: a footprint of a few pixels touches few blocks, and sixteen pixels
-//! are what one group of lanes holds, so that a block's state stays in registers while its list is blended.
+//! A footprint of a few pixels touches few blocks, and sixteen pixels are what one group of lanes holds, so that a block's
+//! state stays in registers while its footprints are blended. Lists of blocks would be long, and a block is looked at
+//! once; so lists are kept per tile, sixteen bits for its blocks with each footprint, and a block's list is picked out of
+//! its tile's when its turn comes ([`super::tile`]).
+//!
+//! A band's footprints are listed in rounds, nearest first, so that lists stay small whatever the scene.
 
 use super::{
     bin::{BAND_ROWS, Bins},
@@ -12,10 +16,87 @@ use crate::simd::{LANES, ROWS, Simd, prefetch, simd_kernel};
 /// Columns and rows of a block.
 pub(super) const BLOCK: usize = 4;
 
-/// Groups of footprints whose memory is asked for ahead.
-const AHEAD: usize = 4;
+/// Columns and rows of a tile.
+pub(super) const TILE: usize = BAND_ROWS;
 
-const BLOCK_ROWS: usize = BAND_ROWS / BLOCK;
+/// Blocks of a tile, row by row.
+pub(super) const BLOCKS: usize = BLOCK_ROWS * BLOCK_ROWS;
+
+/// Groups of footprints whose memory is asked for ahead.
+const AHEAD: usize = 8;
+
+const BLOCK_ROWS: usize = TILE / BLOCK;
+
+/// What one round of a band's lists may hold.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct RoundLimit {
+    /// Footprints; at most 2¹⁶, as a place among them has sixteen bits.
+    pub footprints: usize,
+    /// Listed places, each a footprint and a tile; the last four footprints may exceed it.
+    pub places: usize,
+}
+
+/// More than any but huge scenes need: most bands take one round. Four and one MiB of memory per band at most.
+impl Default for RoundLimit {
+    fn default() -> Self {
+        Self { footprints: 1 << 16, places: 1 << 18 }
+    }
+}
+
+/// A band of rows of the image and what it is made from.
+#[derive(Clone, Copy)]
+pub(super) struct BandView<'a> {
+    pub bins: &'a Bins,
+    pub number: usize,
+    /// Of the image, pixels.
+    pub width: usize,
+    pub height: usize,
+    /// Gaussians whose gradients are wanted; empty if all are.
+    pub active: &'a [bool],
+    pub limit: RoundLimit,
+}
+
+impl BandView<'_> {
+    /// First image row.
+    pub(super) fn first_row(&self) -> usize {
+        self.number * BAND_ROWS
+    }
+
+    /// Rows of the image in the band.
+    pub(super) fn rows(&self) -> usize {
+        BAND_ROWS.min(self.height - self.first_row())
+    }
+
+    pub(super) fn tiles(&self) -> usize {
+        self.width.div_ceil(TILE)
+    }
+
+    /// Number of footprints.
+    pub(super) fn footprints(&self) -> usize {
+        self.bins.band(self.number).len()
+    }
+
+    /// Centre of a tile that is not cut by the border, pixels.
+    pub(super) fn centre(&self, tile: usize) -> [f64; 2] {
+        let half = 0.5 * TILE as f64;
+        [(tile * TILE) as f64 + half, self.first_row() as f64 + half]
+    }
+
+    /// Lane and place within the band of each of a block's pixels that lie in the image.
+    pub(super) fn pixels(&self, tile: usize, block: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
+        let (column, row) = corner(block);
+        let (width, column) = (self.width, tile * TILE + column);
+        let columns = BLOCK.min(width.saturating_sub(column));
+        let rows = BLOCK.min(self.rows().saturating_sub(row));
+        (0..rows)
+            .flat_map(move |y| (0..columns).map(move |x| (y * BLOCK + x, (row + y) * width + column + x)))
+    }
+}
+
+/// First column and row of a block within its tile.
+pub(super) fn corner(block: usize) -> (usize, usize) {
+    ((block % BLOCK_ROWS) * BLOCK, (block / BLOCK_ROWS) * BLOCK)
+}
 
 /// A footprint as the kernels read it, on one cache line.
 ///
@@ -52,220 +133,234 @@ impl Entry {
     }
 }
 
-/// The lists of one band's blocks; blocks are counted down each column of blocks, then to the right, so that
-/// neighbours in the list are neighbours in the image.
+/// A footprint in a tile's list: its place among the entries, and in the upper half a bit for each block that it reaches.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Listed(pub u32);
+
+impl Listed {
+    pub(super) fn place(self) -> usize {
+        (self.0 & 0xFFFF) as usize
+    }
+
+    /// What a list's words have set if the footprint reaches the block.
+    pub(super) fn bit(block: usize) -> u32 {
+        1 << (16 + block)
+    }
+}
+
+/// The lists of one round of a band.
 #[derive(Clone, Debug, Default)]
-pub(super) struct BlockLists {
-    /// The band's footprints, nearest first.
+pub(super) struct TileLists {
+    /// The round's footprints, nearest first.
     pub entries: Vec<Entry>,
-    /// `listed[starts[b]..starts[b + 1]]` belong to block `b`.
+    /// `listed[starts[t]..starts[t + 1]]` belong to tile `t`.
     starts: Vec<u32>,
-    /// Places in `entries`, ascending within a block.
-    listed: Vec<u32>,
+    /// Places ascend within a tile.
+    listed: Vec<Listed>,
     spans: Vec<Spans>,
     next: Vec<u32>,
 }
 
-/// Columns of blocks that a footprint reaches, per row of blocks: from `first` to before `end`.
-#[derive(Clone, Copy, Debug)]
-struct Spans {
-    first: [u32; BLOCK_ROWS],
-    end: [u32; BLOCK_ROWS],
-}
-
 simd_kernel! {
-    /// Lists the footprints of band `number` of a `width × height` image; `active` is empty if all are.
-    pub(super) fn fill(
-        lists: &mut BlockLists,
-        bins: &Bins,
-        number: usize,
-        width: usize,
-        height: usize,
-        active: &[bool],
-    ) = fill_kernel
+    /// Lists the footprints of a band from number `first` on, as many as a round holds.
+    pub(super) fn fill(lists: &mut TileLists, band: &BandView<'_>, first: usize) = fill_kernel
 }
 
 #[inline(always)]
-fn fill_kernel<S: Simd>(
-    lists: &mut BlockLists,
-    bins: &Bins,
-    number: usize,
-    width: usize,
-    height: usize,
-    active: &[bool],
-) {
-    lists.fill::<S>(bins, number, width, height, active);
+fn fill_kernel<S: Simd>(lists: &mut TileLists, band: &BandView<'_>, first: usize) {
+    lists.fill::<S>(band, first);
 }
 
-impl BlockLists {
+impl TileLists {
+    /// See [`fill`]. No sum can wrap: a round ends with the four footprints that reach the limit of its places, and four
+    /// footprints reach no more than four rows of tiles, 2³⁰ at most.
     #[inline(always)]
-    fn fill<S: Simd>(&mut self, bins: &Bins, number: usize, width: usize, height: usize, active: &[bool]) {
-        let first_row = number * BAND_ROWS;
-        let rows = BAND_ROWS.min(height - first_row);
-        let columns = width.div_ceil(BLOCK);
+    pub(super) fn fill<S: Simd>(&mut self, band: &BandView<'_>, first: usize) {
         self.entries.clear();
         self.spans.clear();
-        // Counts: +1 where a span begins and -1 behind its end, summed up along the row of blocks afterwards.
+        // Counts: +1 where a span begins and -1 behind its end, summed up along the row of tiles afterwards.
         self.starts.clear();
-        self.starts.resize((columns + 1) * BLOCK_ROWS + 1, 0);
-        let indices = bins.band(number);
+        self.starts.resize(band.tiles() + 2, 0);
+        let indices = &band.bins.band(band.number)[first..];
+        let indices = &indices[..indices.len().min(band.limit.footprints)];
+        let footprints = &band.bins.projection.footprints;
+        let mut places = 0;
         for (group, indices_of_group) in indices.chunks(ROWS).enumerate() {
+            if places >= band.limit.places {
+                break;
+            }
             // Depth order is no order in memory.
             for &index in indices.iter().skip((group + AHEAD) * ROWS).take(ROWS) {
-                prefetch(&bins.projection.footprints[index as usize]);
+                prefetch(&footprints[index as usize]);
             }
-            let mut reaches = Reaches::default();
-            for (slot, &index) in indices_of_group.iter().enumerate() {
-                let footprint = &bins.projection.footprints[index as usize];
-                let is_active = active.get(index as usize).copied().unwrap_or(true);
+            let mut reaches = [Reach::default(); ROWS];
+            for (reach, &index) in reaches.iter_mut().zip(indices_of_group) {
+                let footprint = &footprints[index as usize];
+                let is_active = band.active.get(index as usize).copied().unwrap_or(true);
                 self.entries.push(Entry::new(footprint, is_active));
-                reaches.set(slot, footprint, first_row);
+                *reach = Reach::new(footprint, band.first_row());
             }
-            let spans = reaches.spans::<S>(rows, width);
+            let spans = spans::<S>(&reaches, band.rows(), band.width);
             for spans in &spans[..indices_of_group.len()] {
-                for row in 0..BLOCK_ROWS {
-                    let start = |column: u32| column as usize * BLOCK_ROWS + row + 1;
-                    let (first, end) = (start(spans.first[row]), start(spans.end[row]));
-                    self.starts[first] = self.starts[first].wrapping_add(1);
-                    self.starts[end] = self.starts[end].wrapping_sub(1);
-                }
+                let tiles = spans.tiles();
+                places += tiles.len();
+                self.starts[tiles.start + 1] = self.starts[tiles.start + 1].wrapping_add(1);
+                self.starts[tiles.end + 1] = self.starts[tiles.end + 1].wrapping_sub(1);
                 self.spans.push(*spans);
             }
         }
-        self.accumulate(columns);
+        self.accumulate();
         self.distribute();
     }
 
-    /// Turns differences along each row of blocks into where each block's list starts.
+    /// Turns differences along the row of tiles into where each tile's list starts.
     #[inline(always)]
-    fn accumulate(&mut self, columns: usize) {
-        let mut open = [0u32; BLOCK_ROWS];
-        let mut start = 0u32;
-        for column in 0..columns {
-            for row in 0..BLOCK_ROWS {
-                let slot = &mut self.starts[column * BLOCK_ROWS + row + 1];
-                open[row] = open[row].wrapping_add(*slot);
-                start += open[row];
-                *slot = start;
-            }
+    fn accumulate(&mut self) {
+        let (mut open, mut start) = (0u32, 0u32);
+        for slot in &mut self.starts {
+            open = open.wrapping_add(*slot);
+            start = start.wrapping_add(open);
+            *slot = start;
         }
-        self.starts.truncate(columns * BLOCK_ROWS + 1);
+        self.starts.pop();
     }
 
     #[inline(always)]
     fn distribute(&mut self) {
         let total = self.starts.last().copied().unwrap_or(0);
-        self.listed.resize(total as usize, 0);
+        self.listed.resize(total as usize, Listed::default());
         self.next.clone_from(&self.starts);
         for (place, spans) in self.spans.iter().enumerate() {
-            for row in 0..BLOCK_ROWS {
-                for column in spans.first[row]..spans.end[row] {
-                    let next = &mut self.next[column as usize * BLOCK_ROWS + row];
-                    self.listed[*next as usize] = place as u32;
-                    *next += 1;
-                }
+            for tile in spans.tiles() {
+                let next = &mut self.next[tile];
+                self.listed[*next as usize] = Listed(spans.blocks(tile) << 16 | place as u32);
+                *next += 1;
             }
         }
     }
 
-    /// Number of blocks, those below the image included.
-    pub(super) fn blocks(&self) -> usize {
-        self.starts.len().saturating_sub(1)
-    }
-
-    /// Places in `entries` of a block's footprints, nearest first.
-    pub(super) fn of(&self, block: usize) -> &[u32] {
-        &self.listed[self.starts[block] as usize..self.starts[block + 1] as usize]
+    /// A tile's list, nearest first.
+    pub(super) fn of(&self, tile: usize) -> &[Listed] {
+        &self.listed[self.starts[tile] as usize..self.starts[tile + 1] as usize]
     }
 }
 
-/// First column of a block, and its first row within the band.
-pub(super) fn corner(block: usize) -> (usize, usize) {
-    ((block / BLOCK_ROWS) * BLOCK, (block % BLOCK_ROWS) * BLOCK)
+/// Columns of blocks that a footprint reaches, per row of blocks: from `first` to before `end`.
+#[derive(Clone, Copy, Debug, Default)]
+struct Spans {
+    first: [i32; BLOCK_ROWS],
+    end: [i32; BLOCK_ROWS],
 }
 
-/// The ellipses inside which the alphas of four footprints can reach the threshold. Each row of lanes is a footprint, each
-/// lane in it a row of blocks of the band.
-#[derive(Default)]
-struct Reaches {
-    /// Mean, pixels; `y` from the band's first row.
-    x: [f32; LANES],
-    y: [f32; LANES],
-    slope: [f32; LANES],
-    /// `2 · variance along a row`, and what the exponent may still fall there.
-    double_conditional: [f32; LANES],
-    reach: [f32; LANES],
-    /// Root of half the inverse variance across rows: squared with the offset, so that neither overflows alone.
-    fall: [f32; LANES],
-    half_height: [f32; LANES],
-    row_of_rightmost: [f32; LANES],
-}
+/// Where a span that is empty begins: to the right of every end.
+const NOWHERE: f32 = 1e9;
 
-impl Reaches {
+impl Spans {
     #[inline(always)]
-    fn set(&mut self, slot: usize, footprint: &Footprint, first_row: usize) {
+    fn tiles(&self) -> std::ops::Range<usize> {
+        let first = self.first.iter().fold(i32::MAX, |least, &first| least.min(first));
+        let end = self.end.iter().fold(0, |most, &end| most.max(end));
+        if first >= end {
+            return 0..0;
+        }
+        first as usize / BLOCK_ROWS..(end as usize).div_ceil(BLOCK_ROWS)
+    }
+
+    /// A bit for each block of a tile that is reached, row by row.
+    #[inline(always)]
+    fn blocks(&self, tile: usize) -> u32 {
+        let left = (tile * BLOCK_ROWS) as i32;
+        let mut bits = 0;
+        for row in 0..BLOCK_ROWS {
+            let first = (self.first[row] - left).clamp(0, BLOCK_ROWS as i32);
+            let end = (self.end[row] - left).clamp(0, BLOCK_ROWS as i32);
+            let before = |column: i32| (1u32 << column) - 1;
+            bits |= (before(end) & !before(first)) << (BLOCK_ROWS * row);
+        }
+        bits
+    }
+}
+
+/// The ellipse inside which a footprint's alpha can reach the threshold.
+#[derive(Clone, Copy, Default)]
+struct Reach {
+    /// Mean, pixels, `y` from the band's first row; row centre shift per row; `2 · variance along a row`.
+    line: [f32; ROWS],
+    /// What the exponent may fall; root of half the inverse variance across rows: squared with the offset, so that
+    /// neither overflows alone; half height; row of the rightmost point.
+    extent: [f32; ROWS],
+}
+
+impl Reach {
+    #[inline(always)]
+    fn new(footprint: &Footprint, first_row: usize) -> Self {
         let [x, y] = footprint.mean;
-        let fields = [
-            (&mut self.x, x),
-            (&mut self.y, y - first_row as f64),
-            (&mut self.slope, footprint.slope),
-            (&mut self.double_conditional, 2.0 * footprint.conditional),
-            (&mut self.reach, footprint.reach),
-            (&mut self.fall, (0.5 * footprint.inverse_yy).sqrt()),
-            (&mut self.half_height, footprint.half_height),
-            (&mut self.row_of_rightmost, footprint.row_of_rightmost),
-        ];
-        for (lanes, value) in fields {
-            lanes[slot * BLOCK_ROWS..][..BLOCK_ROWS].fill(value as f32);
+        Self {
+            line: [
+                x as f32,
+                (y - first_row as f64) as f32,
+                footprint.slope as f32,
+                (2.0 * footprint.conditional) as f32,
+            ],
+            extent: [
+                footprint.reach as f32,
+                (0.5 * footprint.inverse_yy).sqrt() as f32,
+                footprint.half_height as f32,
+                footprint.row_of_rightmost as f32,
+            ],
         }
     }
+}
 
-    /// Columns of blocks per footprint. In a row of blocks the rightmost point is the ellipse's rightmost point of all, or
-    /// lies on that row's edge towards it; the leftmost likewise. Margins cover the rounding of single precision, here
-    /// and in the kernel's alpha: the kernel itself decides at the threshold.
-    #[inline(always)]
-    fn spans<S: Simd>(&self, rows: usize, width: usize) -> [Spans; ROWS] {
-        let mut edges = [[0.0; LANES]; 2];
-        for lane in 0..LANES {
-            let row = lane % BLOCK_ROWS;
-            edges[0][lane] = (row * BLOCK) as f32 + 0.5;
-            edges[1][lane] = ((row + 1) * BLOCK).min(rows) as f32 - 0.5;
-        }
-        let (zero, small) = (S::splat(0.0), S::splat(4e-6));
-        let half_height = S::load(&self.half_height);
-        let height = half_height.mul_add(small, half_height).add(S::splat(1e-3));
-        let y = S::load(&self.y);
-        let above = S::load(&edges[0]).sub(y).max(zero.sub(height));
-        let below = S::load(&edges[1]).sub(y).min(height);
-        let (x, slope, rightmost) = (S::load(&self.x), S::load(&self.slope), S::load(&self.row_of_rightmost));
-        let half = |dy: S| {
-            let root = dy.mul(S::load(&self.fall));
-            S::load(&self.reach).sub(root.mul(root)).max(zero).mul(S::load(&self.double_conditional)).sqrt()
-        };
-        let (left_row, right_row) =
-            (zero.sub(rightmost).max(above).min(below), rightmost.max(above).min(below));
-        let (left_shift, right_shift) = (slope.mul(left_row), slope.mul(right_row));
-        let (left_half, right_half) = (half(left_row), half(right_row));
-        let magnitude = x.mul(x).add(left_shift.mul(left_shift)).add(right_shift.mul(right_shift));
-        let magnitude = magnitude.add(left_half.mul(left_half)).add(right_half.mul(right_half)).sqrt();
-        let margin = magnitude.mul_add(small, S::splat(1e-3 + 0.5));
-        let low = x.add(left_shift).sub(left_half).sub(margin);
-        let high = x.add(right_shift).add(right_half).add(margin).sub(S::splat(1.0));
-        let low = low.ceil().max(zero);
-        let high = high.floor().min(S::splat(width as f32 - 1.0));
-        let is_reached = S::both(below.ge(above), high.ge(low));
-        let quarter = S::splat(1.0 / BLOCK as f32);
-        let (mut first, mut last) = ([0; LANES], [0; LANES]);
-        S::select(is_reached, low.mul(quarter).floor(), zero).store_integers(&mut first);
-        S::select(is_reached, high.mul(quarter).floor(), S::splat(-1.0)).store_integers(&mut last);
-        let mut spans = [Spans { first: [0; BLOCK_ROWS], end: [0; BLOCK_ROWS] }; ROWS];
-        for lane in 0..LANES {
-            let spans = &mut spans[lane / BLOCK_ROWS];
-            spans.first[lane % BLOCK_ROWS] = first[lane] as u32;
-            spans.end[lane % BLOCK_ROWS] = (last[lane] + 1) as u32;
-        }
-        spans
+/// Columns of blocks per footprint, each row of lanes a footprint and each lane in it a row of blocks of the band. In a row of
+/// blocks the rightmost point is the ellipse's rightmost point of all, or lies on that row's edge towards it; the
+/// leftmost likewise. Margins cover the rounding of single precision, here and in the kernel's alpha: the kernel itself
+/// decides at the threshold.
+#[inline(always)]
+fn spans<S: Simd>(reaches: &[Reach; ROWS], rows: usize, width: usize) -> [Spans; ROWS] {
+    let mut edges = [[0.0; LANES]; 2];
+    for lane in 0..LANES {
+        let row = lane % BLOCK_ROWS;
+        edges[0][lane] = (row * BLOCK) as f32 + 0.5;
+        edges[1][lane] = ((row + 1) * BLOCK).min(rows) as f32 - 0.5;
     }
+    let [a, b, c, d] = reaches;
+    let line = S::load_rows([&a.line, &b.line, &c.line, &d.line]);
+    let extent = S::load_rows([&a.extent, &b.extent, &c.extent, &d.extent]);
+    let (x, y) = (line.spread_in_rows::<0>(), line.spread_in_rows::<1>());
+    let (slope, double_conditional) = (line.spread_in_rows::<2>(), line.spread_in_rows::<3>());
+    let (reach, fall) = (extent.spread_in_rows::<0>(), extent.spread_in_rows::<1>());
+    let (half_height, rightmost) = (extent.spread_in_rows::<2>(), extent.spread_in_rows::<3>());
+    let (zero, small) = (S::splat(0.0), S::splat(4e-6));
+    let height = half_height.mul_add(small, half_height).add(S::splat(1e-3));
+    let above = S::load(&edges[0]).sub(y).max(zero.sub(height));
+    let below = S::load(&edges[1]).sub(y).min(height);
+    let half = |dy: S| {
+        let root = dy.mul(fall);
+        reach.sub(root.mul(root)).max(zero).mul(double_conditional).sqrt()
+    };
+    let (left_row, right_row) = (zero.sub(rightmost).max(above).min(below), rightmost.max(above).min(below));
+    let (left_shift, right_shift) = (slope.mul(left_row), slope.mul(right_row));
+    let (left_half, right_half) = (half(left_row), half(right_row));
+    let magnitude = x.mul(x).add(left_shift.mul(left_shift)).add(right_shift.mul(right_shift));
+    let magnitude = magnitude.add(left_half.mul(left_half)).add(right_half.mul(right_half)).sqrt();
+    let margin = magnitude.mul_add(small, S::splat(1e-3 + 0.5));
+    let low = x.add(left_shift).sub(left_half).sub(margin);
+    let high = x.add(right_shift).add(right_half).add(margin).sub(S::splat(1.0));
+    let low = low.ceil().max(zero);
+    let high = high.floor().min(S::splat(width as f32 - 1.0));
+    let is_reached = S::both(below.ge(above), high.ge(low));
+    let quarter = S::splat(1.0 / BLOCK as f32);
+    let (mut first, mut last) = ([0; LANES], [0; LANES]);
+    S::select(is_reached, low.mul(quarter).floor(), S::splat(NOWHERE)).store_integers(&mut first);
+    S::select(is_reached, high.mul(quarter).floor(), S::splat(-1.0)).store_integers(&mut last);
+    let mut spans = [Spans::default(); ROWS];
+    for lane in 0..LANES {
+        let spans = &mut spans[lane / BLOCK_ROWS];
+        spans.first[lane % BLOCK_ROWS] = first[lane];
+        spans.end[lane % BLOCK_ROWS] = last[lane] + 1;
+    }
+    spans
 }
 
 #[cfg(test)]
@@ -280,14 +375,15 @@ mod tests {
     };
 
     /// Blocks that hold a pixel on which the footprint reaches the threshold, by the span of every row.
-    fn blocks_by_rows(footprint: &Footprint, number: usize, width: usize, height: usize) -> Vec<usize> {
+    fn blocks_by_rows(footprint: &Footprint, number: usize, width: usize, height: usize) -> Vec<(usize, usize)> {
+        let row_of_blocks = |row: usize| row / BLOCK * BLOCK_ROWS;
         let first = number * BAND_ROWS;
         let count = BAND_ROWS.min(height - first);
-        let mut blocks: Vec<usize> = rows::rows(footprint, first, count)
+        let mut blocks: Vec<(usize, usize)> = rows::rows(footprint, first, count)
             .filter_map(|row| Some((row, rows::span(footprint, row, width)?)))
             .flat_map(|(row, span)| {
                 (span.first / BLOCK..span.end.div_ceil(BLOCK))
-                    .map(move |column| column * BLOCK_ROWS + (row - first) / BLOCK)
+                    .map(move |column| (column / BLOCK_ROWS, column % BLOCK_ROWS + row_of_blocks(row - first)))
             })
             .collect();
         blocks.sort_unstable();
@@ -302,19 +398,24 @@ mod tests {
         project(instructions, gaussians, camera, 0, &mut bins.projection);
         bins.sort(camera.height, &mut Vec::new());
         let (mut listed, mut needed) = (0, 0);
-        let mut lists = BlockLists::default();
+        let mut lists = TileLists::default();
         for number in 0..bins.bands() {
-            fill(instructions, &mut lists, &bins, number, width, height, &[]);
+            let limit = RoundLimit::default();
+            let band = BandView { bins: &bins, number, width, height, active: &[], limit };
+            fill(instructions, &mut lists, &band, 0);
             for (place, &index) in bins.band(number).iter().enumerate() {
                 let footprint = &bins.projection.footprints[index as usize];
                 let expected = blocks_by_rows(footprint, number, width, height);
-                let is_listed = |block: &usize| lists.of(*block).contains(&(place as u32));
+                let is_listed = |&(tile, block): &(usize, usize)| {
+                    lists.of(tile).iter().any(|at| at.place() == place && at.0 & Listed::bit(block) != 0)
+                };
                 assert!(expected.iter().all(is_listed), "footprint {index} misses a block of band {number}");
                 needed += expected.len();
             }
-            for block in 0..lists.blocks() {
-                listed += lists.of(block).len();
-                assert!(lists.of(block).is_sorted(), "nearest first");
+            for tile in 0..band.tiles() {
+                let list = lists.of(tile);
+                listed += list.iter().map(|at| (at.0 >> 16).count_ones() as usize).sum::<usize>();
+                assert!(list.is_sorted_by_key(|at| at.place()), "nearest first");
             }
         }
         [listed, needed]
@@ -345,5 +446,32 @@ mod tests {
                 assert!(needed > 50, "{needed} blocks at {width}x{height} are no test");
             }
         }
+    }
+
+    #[test]
+    fn a_round_holds_no_more_than_its_limit_and_a_row_of_four_giants() {
+        let camera = &arc(1, 320, 48)[0];
+        let mut gaussians = blobs(1000, 7);
+        gaussians.log_scales.fill([3.0; 3]);
+        gaussians.logit_opacities.fill(0.0);
+        let mut bins = Bins::default();
+        project(Instructions::detect(), &gaussians, camera, 0, &mut bins.projection);
+        bins.sort(camera.height, &mut Vec::new());
+        let limit = RoundLimit { footprints: 300, places: 500 };
+        let view = BandView { bins: &bins, number: 1, width: 320, height: 48, active: &[], limit };
+        assert!(view.footprints() * view.tiles() > 19_000, "all of them reach all tiles");
+        let mut lists = TileLists::default();
+        let mut first = 0;
+        while first < view.footprints() {
+            fill(Instructions::detect(), &mut lists, &view, first);
+            assert!(!lists.entries.is_empty() && lists.entries.len() <= limit.footprints);
+            assert!(lists.listed.len() < limit.places + ROWS * view.tiles(), "{}", lists.listed.len());
+            for (place, entry) in lists.entries.iter().enumerate() {
+                let index = bins.band(1)[first + place] as usize;
+                assert_eq!(entry.mean, bins.projection.footprints[index].mean, "none is left out");
+            }
+            first += lists.entries.len();
+        }
+        assert_eq!(first, view.footprints());
     }
 }

@@ -5,12 +5,13 @@ use std::ops::Add;
 use rayon::prelude::*;
 
 use super::{
-    ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
+    TRANSMITTANCE_MIN,
     bin::{BAND_ROWS, Bins},
-    blend::{BATCH, Band, Local},
-    blocks::corner,
+    blend::BATCH,
+    blocks::{BLOCKS, BandView, RoundLimit, TileLists, fill},
     project::project,
     rows::{rows, span},
+    tile::{Offsets, Tile},
 };
 use crate::{
     cameras::Camera,
@@ -76,10 +77,9 @@ pub fn pair_counts(gaussians: &Gaussians, camera: &Camera) -> PairCounts {
     let in_bands = (0..bins.bands())
         .into_par_iter()
         .map(|number| {
-            let mut band = Band::default();
-            band.reset(instructions, &bins, number, width, height, &[]);
-            let blocks = (0..band.lists.blocks()).map(|block| count_block(&band, block));
-            blocks.fold(count_spans(&bins, number, width, height), Add::add)
+            let limit = RoundLimit::default();
+            let view = BandView { bins: &bins, number, width, height, active: &[], limit };
+            count_spans(&bins, number, width, height) + count_band(instructions, &view)
         })
         .reduce(PairCounts::default, Add::add);
     PairCounts { footprints: order.len() as u64, ..in_bands }
@@ -99,25 +99,49 @@ fn count_spans(bins: &Bins, number: usize, width: usize, height: usize) -> PairC
     counts
 }
 
-fn count_block(band: &Band, block: usize) -> PairCounts {
-    let (column, row) = corner(block);
-    let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
-    // Transmittance per pixel; `None` outside the image and once blending has stopped.
-    let mut open = [None; LANES];
-    band.pixels(block).for_each(|(lane, _)| open[lane] = Some(1.0_f32));
+fn count_band(instructions: Instructions, view: &BandView<'_>) -> PairCounts {
+    let (mut lists, mut tile) = (TileLists::default(), Tile::default());
+    let mut open: Vec<_> =
+        (0..view.tiles() * BLOCKS).map(|number| open(view, number / BLOCKS, number % BLOCKS)).collect();
     let mut counts = PairCounts::default();
-    for (place, &entry) in band.lists.of(block).iter().enumerate() {
-        // As the kernel does, which looks after every batch.
+    let mut first = 0;
+    while first < view.footprints() {
+        fill(instructions, &mut lists, view, first);
+        first += lists.entries.len();
+        for (number, open) in open.chunks_mut(BLOCKS).enumerate() {
+            tile.gather(&lists, number, view.centre(number));
+            for (block, open) in open.iter_mut().enumerate() {
+                counts = counts + count_block(&mut tile, block, open);
+            }
+        }
+    }
+    counts
+}
+
+/// Transmittance per pixel; `None` outside the image and once blending has stopped.
+type OpenPixels = [Option<f32>; LANES];
+
+fn open(view: &BandView<'_>, tile: usize, block: usize) -> OpenPixels {
+    let mut open = [None; LANES];
+    view.pixels(tile, block).for_each(|(lane, _)| open[lane] = Some(1.0));
+    open
+}
+
+fn count_block(tile: &mut Tile, block: usize, open: &mut OpenPixels) -> PairCounts {
+    let mut counts = PairCounts::default();
+    let offsets = Offsets::<Plain>::new(block);
+    let count = tile.list::<Plain>(block);
+    for (place, &seen) in tile.listed(count).iter().enumerate() {
+        // As the kernel does, which looks before every batch.
         if place % BATCH == 0 && open.iter().all(Option::is_none) {
             break;
         }
-        let entry = &band.lists.entries[entry as usize];
         let mut alphas = [0.0; LANES];
-        Local::new(entry, x, y).alpha::<Plain>(entry).store(&mut alphas);
+        tile.seen[seen as usize].alpha(&offsets).store(&mut alphas);
         let mut is_live = false;
-        for (pixel, alpha) in open.iter_mut().zip(alphas.map(|alpha| alpha.min(ALPHA_MAX))) {
+        for (pixel, alpha) in open.iter_mut().zip(alphas) {
             let Some(before) = *pixel else { continue };
-            if !(alpha >= ALPHA_MIN) {
+            if alpha == 0.0 {
                 continue;
             }
             is_live = true;
@@ -138,7 +162,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        raster::LOW_PASS,
+        raster::{ALPHA_MAX, ALPHA_MIN, LOW_PASS},
         testing::{arc, blobs, on_threads},
     };
 

@@ -3,8 +3,13 @@
 //! Means barely move from step to step, so the last order of a view is almost the next one. Whatever the start, the
 //! result is the one order by depth, ties by index: a last pass of insertions leaves nothing out of place.
 
+use crate::simd::prefetch;
+
 /// Insertions may move this many elements per element before a sort from scratch is cheaper.
 const MOVES_PER_ELEMENT: usize = 8;
+
+/// Depths that are asked for ahead: depth order is no order in memory.
+const AHEAD: usize = 16;
 
 /// Buffers of [`DepthOrder::sort`].
 #[derive(Clone, Debug, Default)]
@@ -41,7 +46,10 @@ impl DepthOrder {
         self.keys.clear();
         self.is_listed.clear();
         self.is_listed.resize(depths.len(), false);
-        for &index in order {
+        for (number, &index) in order.iter().enumerate() {
+            if let Some(depth) = order.get(number + AHEAD).and_then(|&later| depths.get(later as usize)) {
+                prefetch(depth);
+            }
             // Gaussians may have been replaced since.
             let Some(depth) = depths.get(index as usize) else { continue };
             if !depth.is_nan() && !std::mem::replace(&mut self.is_listed[index as usize], true) {

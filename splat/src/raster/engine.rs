@@ -41,7 +41,7 @@ impl CpuEngine {
         let mut image = Image::filled(camera.width, camera.height, [0.0; 3]);
         let degree = gaussians.sh_degree;
         pass.forward(gaussians, camera, degree, background, &mut image, &mut []);
-        pass.blend_backward(background, image_gradient, alpha_gradient);
+        pass.blend_backward(camera, background, image_gradient, alpha_gradient);
         let mut gradients = GaussianGradients::zeros(gaussians);
         pass.project_backward(gaussians, camera, degree, &[], &mut gradients);
         gradients

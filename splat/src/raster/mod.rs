@@ -23,6 +23,7 @@ mod rows;
 mod session;
 #[cfg(test)]
 mod tests;
+mod tile;
 
 pub use counts::{PairCounts, pair_counts};
 pub use engine::CpuEngine;

@@ -6,6 +6,7 @@ use super::{
     bin::{BAND_ROWS, Bins},
     blend::{Band, blend},
     blend_backward::blend_backward,
+    blocks::{BandView, RoundLimit},
     project::{CHUNK, View, project},
     project_backward::{GradientChunk, project_backward},
 };
@@ -24,6 +25,9 @@ pub struct Pass {
     instructions: Instructions,
     bins: Bins,
     bands: Vec<Band>,
+    /// What [`Pass::blend`] was told.
+    active: Vec<bool>,
+    pub(super) limit: RoundLimit,
     by_projected_mean: Vec<[f32; 2]>,
 }
 
@@ -69,13 +73,15 @@ impl Pass {
         image: &mut Image,
         alpha: &mut [f32],
     ) {
+        self.active.clear();
+        self.active.extend_from_slice(active);
         let (width, height) = (camera.width as usize, camera.height as usize);
-        let (bins, instructions) = (&self.bins, self.instructions);
+        let (bins, active, limit, instructions) = (&self.bins, &self.active, self.limit, self.instructions);
         self.bands.resize_with(bins.bands(), Band::default);
         let band_pixels = (BAND_ROWS * width).max(1);
         let render = |number: usize, band: &mut Band, pixels: &mut [f32], alpha: &mut [f32]| {
-            band.reset(instructions, bins, number, width, height, active);
-            blend(instructions, band, background, pixels, alpha);
+            let view = BandView { bins, number, width, height, active, limit };
+            blend(instructions, band, &view, background, pixels, alpha);
         };
         let bands = self.bands.par_iter_mut().zip(image.pixels.par_chunks_mut(3 * band_pixels)).enumerate();
         if alpha.is_empty() {
@@ -88,13 +94,21 @@ impl Pass {
     }
 
     /// Stage 4: sums over the pixels from the gradient by the image, `H × W × 3`, and by alpha, `H × W` or empty.
-    pub fn blend_backward(&mut self, background: [f32; 3], image_gradient: &[f32], alpha_gradient: &[f32]) {
-        let instructions = self.instructions;
-        self.bands.par_iter_mut().for_each(|band| {
-            let pixels = band.first_row * band.width..(band.first_row + band.rows) * band.width;
+    pub fn blend_backward(
+        &mut self,
+        camera: &Camera,
+        background: [f32; 3],
+        image_gradient: &[f32],
+        alpha_gradient: &[f32],
+    ) {
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let (bins, active, limit, instructions) = (&self.bins, &self.active, self.limit, self.instructions);
+        self.bands.par_iter_mut().enumerate().for_each(|(number, band)| {
+            let view = BandView { bins, number, width, height, active, limit };
+            let pixels = view.first_row() * width..(view.first_row() + view.rows()) * width;
             let gradient = &image_gradient[3 * pixels.start..3 * pixels.end];
             let alpha_gradient = alpha_gradient.get(pixels).unwrap_or_default();
-            blend_backward(instructions, band, background, gradient, alpha_gradient);
+            blend_backward(instructions, band, &view, background, gradient, alpha_gradient);
         });
     }
 

@@ -50,6 +50,7 @@ pub(super) struct BandRange {
 /// slanted the footprint is: `slope = cov_xy / cov_yy` is the regression line through the row centres and
 /// `1 / inverse_conditional = cov_xx - cov_xy² / cov_yy` the variance along a row.
 #[derive(Clone, Copy, Debug, Default)]
+#[repr(align(64))]
 pub(super) struct Footprint {
     /// Projected mean, pixels.
     pub mean: [f64; 2],

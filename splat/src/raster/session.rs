@@ -83,7 +83,7 @@ impl Session for CpuSession {
         self.pass.bin(camera, order);
         self.pass.blend(camera, self.background, &self.active, &mut self.rendered, &mut []);
         let value = loss.evaluate(&self.rendered, &mut self.workspace, &mut self.image_gradient);
-        self.pass.blend_backward(self.background, &self.image_gradient, &[]);
+        self.pass.blend_backward(camera, self.background, &self.image_gradient, &[]);
         self.pass.project_backward(
             &self.gaussians,
             camera,

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use super::{CpuEngine, Pass};
+use super::{CpuEngine, Pass, blocks::RoundLimit};
 use crate::{
     engine::{Engine, EngineError, SessionInput, TrainingView},
     gaussians::{Gaussians, gradients::GaussianGradients},
@@ -326,7 +326,7 @@ fn frozen_gaussians_leave_the_gradients_of_the_others_as_they_are() {
         pass.project(&gaussians, camera, degree);
         pass.bin(camera, &mut Vec::new());
         pass.blend(camera, BLACK, active, &mut image, &mut []);
-        pass.blend_backward(BLACK, &seeds, &[]);
+        pass.blend_backward(camera, BLACK, &seeds, &[]);
         let mut gradients = GaussianGradients::zeros(&gaussians);
         pass.project_backward(&gaussians, camera, degree, active, &mut gradients);
         gradients
@@ -355,6 +355,47 @@ fn more_gaussians_than_a_chunk_are_drawn_and_differentiated_as_their_permutation
         assert_eq!(a.means[index], b.means[place]);
         assert_eq!(a.rotations[index], b.rotations[place]);
         assert_eq!(a.sh[12 * index..12 * index + 12], b.sh[12 * place..12 * place + 12]);
+    }
+}
+
+/// Image, alpha and gradient of a pass whose rounds hold no more than `limit`.
+fn in_rounds(gaussians: &Gaussians, limit: RoundLimit, instructions: Instructions) -> (Vec<f32>, Vec<f32>) {
+    let camera = &arc(3, 70, 45)[1];
+    let background = [0.3, 0.2, 0.1];
+    let seeds = seeds(3 * 70 * 45);
+    let mut pass = Pass::new(instructions);
+    pass.limit = limit;
+    let mut image = Image::filled(70, 45, BLACK);
+    let mut alpha = vec![0.0; 70 * 45];
+    let degree = gaussians.sh_degree;
+    pass.forward(gaussians, camera, degree, background, &mut image, &mut alpha);
+    pass.blend_backward(camera, background, &seeds, &seeds[..70 * 45]);
+    let mut gradients = GaussianGradients::zeros(gaussians);
+    pass.project_backward(gaussians, camera, degree, &[], &mut gradients);
+    ([image.pixels, alpha].concat(), flat(&gradients))
+}
+
+#[test]
+fn rounds_of_any_size_give_the_same_bytes() {
+    // Giants that fill the image, faint in one set so that no pixel stops and opaque in the other so that all do, before
+    // the last of the smaller ones.
+    let scene = |logit: f32| {
+        let mut gaussians = blobs(600, 61);
+        for index in (0..600).step_by(3) {
+            gaussians.log_scales[index] = [2.0; 3];
+            gaussians.logit_opacities[index] = logit;
+        }
+        gaussians
+    };
+    let small = [(1 << 16, 40), (100, 1 << 18), (64, 300), (1, 1 << 18)];
+    for (gaussians, instructions) in
+        [-5.0, 1.0].into_iter().flat_map(|logit| Instructions::available().map(move |set| (scene(logit), set)))
+    {
+        let whole = in_rounds(&gaussians, RoundLimit::default(), instructions);
+        for (footprints, places) in small {
+            let parts = in_rounds(&gaussians, RoundLimit { footprints, places }, instructions);
+            assert!(parts == whole, "{footprints} footprints or {places} places at {}", instructions.set());
+        }
     }
 }
 

@@ -5,7 +5,7 @@ use std::{fmt, str::FromStr};
 /// A compilation of the kernels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InstructionSet {
-    /// AVX-512 F, VL, DQ and BW.
+    /// AVX-512 F, VL, DQ and BW, and POPCNT.
     Avx512,
     /// AVX2 and FMA.
     Avx2,
@@ -25,7 +25,8 @@ impl InstructionSet {
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512bw")
                 && is_x86_feature_detected!("avx2")
-                && is_x86_feature_detected!("fma"),
+                && is_x86_feature_detected!("fma")
+                && is_x86_feature_detected!("popcnt"),
             is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
         );
         #[cfg(not(target_arch = "x86_64"))]

@@ -49,6 +49,8 @@ pub(crate) trait Simd: Copy {
     fn store_integers(self, to: &mut [i32; LANES]);
     /// `self * factor + term`, rounded once where the instruction set can.
     fn mul_add(self, factor: Self, term: Self) -> Self;
+    /// `term - self * factor`, rounded once where the instruction set can.
+    fn negated_mul_add(self, factor: Self, term: Self) -> Self;
     /// The larger; `other` where `self` is NaN.
     fn max(self, other: Self) -> Self;
     /// The smaller; `other` where `self` is NaN.
@@ -67,23 +69,30 @@ pub(crate) trait Simd: Copy {
     /// In each row, the sum of that row of each argument, taken as `(0 + 2) + (1 + 3)`.
     fn row_sums(arguments: [Self; ROWS]) -> Self;
 
-    /// `2^x` for `x ≤ 127`, relative error below 2.5e-7 for `x ≥ -126`; smaller and NaN arguments give `2^-126`.
+    /// Each argument a row.
+    fn load_rows(rows: [&[f32; ROWS]; ROWS]) -> Self;
+    /// Lane `COLUMN` of each row in all lanes of the row.
+    fn spread_in_rows<const COLUMN: usize>(self) -> Self;
+
+    /// Writes the numbers from `first` on of those `words` that have one of the bits of `mask`, ascending, and returns
+    /// how many. The rest of `to` is overwritten with anything.
+    fn positions(words: &[u32; LANES], mask: u32, first: u32, to: &mut [u32; LANES]) -> usize;
+
+    /// `2^x` for `-126 ≤ x ≤ 127`, relative error below 2.5e-7; anything for other arguments.
     ///
-    /// Splits off the nearest integer by the addition of `1.5 · 2²³` and evaluates the Taylor polynomial of degree 6 on
-    /// `[-1/2, 1/2]`, whose remainder `(ln 2 / 2)^7 / 7!` is 1.2e-7 relative at the ends.
+    /// Splits off the nearest integer by the addition of `1.5 · 2²³` and evaluates the polynomial of degree 5 whose largest
+    /// relative error on `[-1/2, 1/2]` is least, 0.8e-7 before rounding.
     #[inline(always)]
     fn exp2(self) -> Self {
         let round = Self::splat(12_582_912.0);
-        let x = self.max(Self::splat(-126.0));
-        let rounded = x.add(round);
-        let fraction = x.sub(rounded.sub(round));
-        let mut power = Self::splat(1.540_353e-4);
-        power = power.mul_add(fraction, Self::splat(1.333_355_8e-3));
-        power = power.mul_add(fraction, Self::splat(9.618_129e-3));
-        power = power.mul_add(fraction, Self::splat(5.550_410_9e-2));
-        power = power.mul_add(fraction, Self::splat(2.402_265_1e-1));
-        power = power.mul_add(fraction, Self::splat(6.931_472e-1));
-        power = power.mul_add(fraction, Self::splat(1.0));
+        let rounded = self.add(round);
+        let fraction = self.sub(rounded.sub(round));
+        let mut power = Self::splat(1.327_647_2e-3);
+        power = power.mul_add(fraction, Self::splat(9.675_542e-3));
+        power = power.mul_add(fraction, Self::splat(5.550_713e-2));
+        power = power.mul_add(fraction, Self::splat(2.402_212e-1));
+        power = power.mul_add(fraction, Self::splat(6.931_470_04e-1));
+        power = power.mul_add(fraction, Self::splat(1.000_000_1));
         power.add_to_exponent(rounded)
     }
 }
@@ -114,7 +123,7 @@ macro_rules! simd_kernel {
             #[cfg(target_arch = "x86_64")]
             {
                 use $crate::simd::{Avx2, Avx512, InstructionSet};
-                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,popcnt")]
                 fn avx512($($argument: $type),*) {
                     $kernel::<Avx512>($($argument),*);
                 }

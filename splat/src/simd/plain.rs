@@ -60,6 +60,10 @@ impl Simd for Plain {
         Self(std::array::from_fn(|lane| multiply_add(self.0[lane], factor.0[lane], term.0[lane])))
     }
     #[inline(always)]
+    fn negated_mul_add(self, factor: Self, term: Self) -> Self {
+        Self(std::array::from_fn(|lane| multiply_add(-self.0[lane], factor.0[lane], term.0[lane])))
+    }
+    #[inline(always)]
     fn max(self, other: Self) -> Self {
         self.zip(other, |a, b| if a > b { a } else { b })
     }
@@ -97,6 +101,27 @@ impl Simd for Plain {
         std::array::from_fn(|row| {
             Self(std::array::from_fn(|lane| arguments[lane / ROWS].0[ROWS * row + lane % ROWS]))
         })
+    }
+
+    #[inline(always)]
+    fn load_rows(rows: [&[f32; ROWS]; ROWS]) -> Self {
+        Self(std::array::from_fn(|lane| rows[lane / ROWS][lane % ROWS]))
+    }
+
+    #[inline(always)]
+    fn spread_in_rows<const COLUMN: usize>(self) -> Self {
+        Self(std::array::from_fn(|lane| self.0[lane - lane % ROWS + COLUMN]))
+    }
+
+    #[inline(always)]
+    fn positions(words: &[u32; LANES], mask: u32, first: u32, to: &mut [u32; LANES]) -> usize {
+        // Written whether it counts or not: which bits are set follows no pattern that a branch could learn.
+        let mut count = 0;
+        for (place, word) in words.iter().enumerate() {
+            to[count % LANES] = first + place as u32;
+            count += usize::from(word & mask != 0);
+        }
+        count
     }
 
     #[inline(always)]

@@ -23,17 +23,6 @@ fn exp2_stays_within_its_bound_over_the_whole_range_on_every_instruction_set() {
     }
 }
 
-#[test]
-fn exp2_of_what_is_no_small_number_is_tiny() {
-    for instructions in Instructions::available() {
-        for x in [f32::NAN, f32::NEG_INFINITY, -1e30, -127.0] {
-            let mut found = [0.0; LANES];
-            powers(instructions, &[x; LANES], &mut found);
-            assert_eq!(found, [f32::MIN_POSITIVE; LANES], "{} 2^{x}", instructions.set());
-        }
-    }
-}
-
 /// Runs every operation of an instruction set on the same numbers as [`Plain`].
 #[inline(always)]
 fn same_as_plain<S: Simd>() {
@@ -77,6 +66,21 @@ fn same_as_plain<S: Simd>() {
     let (f, g) = ([s, t, s.add(t), s.mul(t)], [p, q, p.add(q), p.mul(q)]);
     assert_eq!(S::transpose(f).map(lanes), Plain::transpose(g).map(lanes));
     assert_eq!(lanes(S::row_sums(f)), lanes(Plain::row_sums(g)));
+    run("negated_mul_add", s.negated_mul_add(t, s), p.negated_mul_add(q, p));
+    let rows = [[1.0, 2.0, 3.0, 4.0], [5.0; 4], [-1.0, 0.5, 0.25, 8.0], [0.0, 1.0, 0.0, 2.0]];
+    let (fast, plain) = (S::load_rows(rows.each_ref()), Plain::load_rows(rows.each_ref()));
+    assert_eq!(lanes(fast), rows.concat()[..]);
+    assert_eq!(lanes(fast.spread_in_rows::<0>()), lanes(plain.spread_in_rows::<0>()));
+    assert_eq!(lanes(fast.spread_in_rows::<1>()), lanes(plain.spread_in_rows::<1>()));
+    assert_eq!(lanes(fast.spread_in_rows::<2>()), lanes(plain.spread_in_rows::<2>()));
+    assert_eq!(lanes(fast.spread_in_rows::<3>())[4..9], [5.0, 5.0, 5.0, 5.0, 8.0]);
+    let words: [u32; LANES] = std::array::from_fn(|lane| (lane as u32).wrapping_mul(2_654_435_761) >> 12);
+    for mask in (0..20).map(|bit| 1 << bit).chain([0, u32::MAX]) {
+        let mut found = [0; LANES];
+        let count = S::positions(&words, mask, 100, &mut found);
+        let expected = (100..).zip(words).filter(|(_, word)| word & mask != 0).map(|(number, _)| number);
+        assert!(found[..count].iter().copied().eq(expected), "mask {mask:x}");
+    }
     assert_eq!(lanes(S::transpose([s, t, s, t])[2])[..5], [a[8], a[9], a[10], a[11], b[8]]);
 }
 

@@ -2,7 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use super::{LANES, ROWS, Simd};
+use super::{LANES, Plain, ROWS, Simd};
 
 /// One 512-bit register.
 #[derive(Clone, Copy)]
@@ -74,6 +74,40 @@ impl Simd for Avx512 {
     #[inline(always)]
     fn min(self, other: Self) -> Self {
         Self(intrinsic!(_mm512_min_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn negated_mul_add(self, factor: Self, term: Self) -> Self {
+        Self(intrinsic!(_mm512_fnmadd_ps(self.0, factor.0, term.0)))
+    }
+    #[inline(always)]
+    fn load_rows([a, b, c, d]: [&[f32; ROWS]; ROWS]) -> Self {
+        intrinsic!({
+            let upper = _mm512_castps128_ps512(_mm_loadu_ps(a.as_ptr()));
+            let upper = _mm512_insertf32x4::<1>(upper, _mm_loadu_ps(b.as_ptr()));
+            let three = _mm512_insertf32x4::<2>(upper, _mm_loadu_ps(c.as_ptr()));
+            Self(_mm512_insertf32x4::<3>(three, _mm_loadu_ps(d.as_ptr())))
+        })
+    }
+    #[inline(always)]
+    fn spread_in_rows<const COLUMN: usize>(self) -> Self {
+        Self(match COLUMN {
+            0 => intrinsic!(_mm512_permute_ps::<0x00>(self.0)),
+            1 => intrinsic!(_mm512_permute_ps::<0x55>(self.0)),
+            2 => intrinsic!(_mm512_permute_ps::<0xAA>(self.0)),
+            _ => intrinsic!(_mm512_permute_ps::<0xFF>(self.0)),
+        })
+    }
+    #[inline(always)]
+    fn positions(words: &[u32; LANES], mask: u32, first: u32, to: &mut [u32; LANES]) -> usize {
+        intrinsic!({
+            let words = _mm512_loadu_epi32(words.as_ptr().cast());
+            let flags = _mm512_test_epi32_mask(words, _mm512_set1_epi32(mask.cast_signed()));
+            let places = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+            let numbers = _mm512_add_epi32(places, _mm512_set1_epi32(first.cast_signed()));
+            // Compressed in a register: into memory the instruction is many times slower.
+            _mm512_storeu_epi32(to.as_mut_ptr().cast(), _mm512_maskz_compress_epi32(flags, numbers));
+            flags.count_ones() as usize
+        })
     }
     #[inline(always)]
     fn ge(self, other: Self) -> Self::Mask {
@@ -205,6 +239,33 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn min(self, other: Self) -> Self {
         self.zip(other, |a, b| intrinsic!(_mm256_min_ps(a, b)))
+    }
+    #[inline(always)]
+    fn negated_mul_add(self, factor: Self, term: Self) -> Self {
+        Self(
+            intrinsic!(_mm256_fnmadd_ps(self.0, factor.0, term.0)),
+            intrinsic!(_mm256_fnmadd_ps(self.1, factor.1, term.1)),
+        )
+    }
+    #[inline(always)]
+    fn load_rows([a, b, c, d]: [&[f32; ROWS]; ROWS]) -> Self {
+        intrinsic!(Self(
+            _mm256_loadu2_m128(b.as_ptr(), a.as_ptr()),
+            _mm256_loadu2_m128(d.as_ptr(), c.as_ptr())
+        ))
+    }
+    #[inline(always)]
+    fn spread_in_rows<const COLUMN: usize>(self) -> Self {
+        match COLUMN {
+            0 => self.each(|a| intrinsic!(_mm256_permute_ps::<0x00>(a))),
+            1 => self.each(|a| intrinsic!(_mm256_permute_ps::<0x55>(a))),
+            2 => self.each(|a| intrinsic!(_mm256_permute_ps::<0xAA>(a))),
+            _ => self.each(|a| intrinsic!(_mm256_permute_ps::<0xFF>(a))),
+        }
+    }
+    #[inline(always)]
+    fn positions(words: &[u32; LANES], mask: u32, first: u32, to: &mut [u32; LANES]) -> usize {
+        Plain::positions(words, mask, first, to)
     }
     #[inline(always)]
     fn ge(self, other: Self) -> Self::Mask {
