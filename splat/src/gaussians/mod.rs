@@ -5,6 +5,7 @@
 
 pub mod delta;
 pub mod gradients;
+pub(crate) mod part;
 pub mod sh;
 pub mod validate;
 

@@ -21,44 +21,6 @@ use super::{
 };
 use crate::simd::{Group, LANES, ROWS, Simd, simd_kernel};
 
-/// Gradient of the loss by one footprint.
-///
-/// With `v = alpha · ∂loss/∂alpha`, `d` the offset from the row centre and `dy` that from the mean's row, the moments of
-/// `v` suffice for the footprint's position and shape.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct FootprintGradient {
-    /// `Σ v`: by the logarithm of the opacity.
-    pub v: f64,
-    /// `Σ v d`.
-    pub v_d: f64,
-    /// `Σ v d²`.
-    pub v_dd: f64,
-    /// `Σ v dy`.
-    pub v_y: f64,
-    /// `Σ v d dy`.
-    pub v_dy: f64,
-    /// `Σ v dy²`.
-    pub v_yy: f64,
-    /// By the colour.
-    pub colour: [f64; 3],
-}
-
-impl FootprintGradient {
-    /// Adds a band's share.
-    pub(super) fn add(&mut self, sums: &Sums) {
-        let [v, v_d, v_dd, v_y, v_dy, v_yy, red, green, blue, ..] = sums.map(f64::from);
-        self.v += v;
-        self.v_d += v_d;
-        self.v_dd += v_dd;
-        self.v_y += v_y;
-        self.v_dy += v_dy;
-        self.v_yy += v_yy;
-        for (sum, value) in self.colour.iter_mut().zip([red, green, blue]) {
-            *sum += value;
-        }
-    }
-}
-
 simd_kernel! {
     /// Fills the band's sums. `gradient` is that of the image's values in the band's rows, `rows × width × 3`,
     /// `alpha_gradient` `rows × width` or empty. Sums of entries that are not active stay zero, but their light is taken

@@ -7,8 +7,9 @@ use super::{
     blend::{Band, blend},
     blend_backward::blend_backward,
     blocks::{BandView, RoundLimit},
-    project::{CHUNK, View, project},
-    project_backward::{GradientChunk, project_backward},
+    local::View,
+    project::{CHUNK, project},
+    project_backward::{Backward, project_backward},
 };
 use crate::{
     cameras::Camera,
@@ -123,23 +124,16 @@ impl Pass {
         gradients: &mut GaussianGradients,
     ) {
         let (bins, bands, instructions) = (&self.bins, &self.bands, self.instructions);
-        let view = View { camera, centre: camera.centre(), sh_degree };
-        let stride = gaussians.sh_coefficients() * 3;
+        let backward = Backward { view: View::new(camera, gaussians, sh_degree), bins, bands, active };
         self.by_projected_mean.resize(gaussians.len(), [0.0; 2]);
-        let arrays = (
-            gradients.means.par_chunks_mut(CHUNK),
-            gradients.rotations.par_chunks_mut(CHUNK),
-            gradients.log_scales.par_chunks_mut(CHUNK),
-            gradients.logit_opacities.par_chunks_mut(CHUNK),
-            gradients.sh.par_chunks_mut(CHUNK * stride),
-            self.by_projected_mean.par_chunks_mut(CHUNK),
+        let projected_means = self.by_projected_mean.par_chunks_mut(CHUNK);
+        gradients.parts_mut(CHUNK).zip(projected_means).enumerate().for_each(
+            |(chunk, (gradients, projected_means))| {
+                let first = chunk * CHUNK;
+                let part = gaussians.part().slice(first..first + projected_means.len());
+                project_backward(instructions, part, &backward, first, gradients, projected_means);
+            },
         );
-        arrays.into_par_iter().enumerate().for_each(|(chunk, arrays)| {
-            let (means, rotations, log_scales, logit_opacities, sh, projected_means) = arrays;
-            let gradients =
-                GradientChunk { means, rotations, log_scales, logit_opacities, sh, projected_means };
-            project_backward(instructions, gaussians, bins, bands, &view, active, chunk * CHUNK, gradients);
-        });
     }
 
     /// The Gaussians that the view shows, each with the gradient by its projected mean, per pixel, after stage 5.

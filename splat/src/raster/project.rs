@@ -1,16 +1,21 @@
 //! Stage 1: each Gaussian's footprint, colour and depth in one view.
 //!
-//! Works in f64: the cost is per Gaussian, not per pixel, and needles of aspect ratio 1e4 lose all of f32's digits
+//! Works on eight Gaussians at a time in f64: the cost is per Gaussian, not per pixel, and needles of aspect ratio 1e4 lose all of f32's digits
 //! in the determinant of their projected covariance.
 
-use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::{ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, NEAR_PLANE, bin::BAND_ROWS, colour};
+use super::{
+    ALPHA_MIN, NEAR_PLANE,
+    bin::BAND_ROWS,
+    colour::{Coefficients, Triple},
+    lanes::{Geometry, sigmoid},
+    local::{Covariance, Lens, LocalProjection, View, sight, store_direction},
+};
 use crate::{
     cameras::Camera,
-    gaussians::Gaussians,
-    simd::{Instructions, Simd, simd_kernel},
+    gaussians::{Gaussians, part::Part},
+    simd::{Doubles, Instructions, LANES, OCTET, Simd, simd_kernel},
 };
 
 /// Gaussians per parallel task.
@@ -76,71 +81,6 @@ pub(super) struct Footprint {
     pub colour: [f32; 3],
 }
 
-/// The local affine projection of one Gaussian, shared by this stage and its gradient.
-pub(super) struct LocalProjection {
-    /// Mean in camera axes.
-    pub camera: DVec3,
-    /// `x / z` and `y / z` after the clamp to the widened frustum.
-    pub slope: [f64; 2],
-    /// Whether the clamp was active, per axis.
-    pub clamped: [bool; 2],
-    /// Rows of `J W`: derivative of the pixel position by the world position.
-    pub rows: [DVec3; 2],
-    /// `R diag(exp(s))`: world axes of the Gaussian.
-    pub axes: DMat3,
-    /// The two rows of `J W R diag(exp(s))`.
-    pub spread: [DVec3; 2],
-}
-
-/// `None` behind the near plane.
-#[inline(always)]
-pub(super) fn local_projection(
-    gaussians: &Gaussians,
-    index: usize,
-    camera: &Camera,
-) -> Option<LocalProjection> {
-    let point = camera.to_camera(gaussians.mean(index));
-    if !(point.z > NEAR_PLANE) {
-        return None;
-    }
-    let (width, height) = (f64::from(camera.width), f64::from(camera.height));
-    let (slope_x, clamped_x) = clamp_slope(point.x / point.z, camera.fx, camera.cx, width);
-    let (slope_y, clamped_y) = clamp_slope(point.y / point.z, camera.fy, camera.cy, height);
-    let (scale_x, scale_y) = (camera.fx / point.z, camera.fy / point.z);
-    let to_world = camera.rotation.transpose();
-    let rows = [
-        to_world * DVec3::new(scale_x, 0.0, -scale_x * slope_x),
-        to_world * DVec3::new(0.0, scale_y, -scale_y * slope_y),
-    ];
-    let [a, b, c] = gaussians.log_scales[index];
-    let scale = DVec3::new(a.into(), b.into(), c.into()).exp();
-    let axes = DMat3::from_quat(gaussians.rotation(index)) * DMat3::from_diagonal(scale);
-    let from_axes = axes.transpose();
-    let spread = [from_axes * rows[0], from_axes * rows[1]];
-    Some(LocalProjection {
-        camera: point,
-        slope: [slope_x, slope_y],
-        clamped: [clamped_x, clamped_y],
-        rows,
-        axes,
-        spread,
-    })
-}
-
-#[inline(always)]
-fn clamp_slope(slope: f64, focal: f64, principal: f64, size: f64) -> (f64, bool) {
-    let margin = FRUSTUM_MARGIN * 0.5 * size / focal;
-    let low = -(principal / focal + margin);
-    let high = (size - principal) / focal + margin;
-    if slope < low {
-        return (low, true);
-    }
-    if slope > high {
-        return (high, true);
-    }
-    (slope, false)
-}
-
 /// Projects every Gaussian; spherical harmonics up to `sh_degree`.
 pub(super) fn project(
     instructions: Instructions,
@@ -153,117 +93,182 @@ pub(super) fn project(
     projection.footprints.resize(count, Footprint::default());
     projection.depths.resize(count, f64::NAN);
     projection.bands.resize(count, BandRange::default());
-    let view = View { camera, centre: camera.centre(), sh_degree };
+    let view = View::new(camera, gaussians, sh_degree);
     let arrays = (
         projection.footprints.par_chunks_mut(CHUNK),
         projection.depths.par_chunks_mut(CHUNK),
         projection.bands.par_chunks_mut(CHUNK),
     );
     arrays.into_par_iter().enumerate().for_each(|(chunk, (footprints, depths, bands))| {
-        project_chunk(instructions, gaussians, &view, chunk * CHUNK, footprints, depths, bands);
+        let first = chunk * CHUNK;
+        let part = gaussians.part().slice(first..first + depths.len());
+        project_chunk(instructions, part, &view, footprints, depths, bands);
     });
 }
 
-/// A view as the stages of a Gaussian need it.
-pub(super) struct View<'a> {
-    pub camera: &'a Camera,
-    /// Of the camera, world units.
-    pub centre: DVec3,
-    pub sh_degree: u32,
-}
-
 simd_kernel! {
-    /// The Gaussians from `first` on.
+    /// The Gaussians of a part, which is not empty.
     fn project_chunk(
-        gaussians: &Gaussians,
+        part: Part<'_>,
         view: &View<'_>,
-        first: usize,
         footprints: &mut [Footprint],
         depths: &mut [f64],
         bands: &mut [BandRange],
     ) = project_kernel
 }
 
-/// Plain double precision that gains from three-operand instructions.
 #[inline(always)]
 fn project_kernel<S: Simd>(
-    gaussians: &Gaussians,
+    part: Part<'_>,
     view: &View<'_>,
-    first: usize,
     footprints: &mut [Footprint],
     depths: &mut [f64],
     bands: &mut [BandRange],
 ) {
-    for (place, slot) in footprints.iter_mut().enumerate() {
-        let projected = footprint(gaussians, first + place, view);
-        (depths[place], bands[place]) = match projected {
-            Some((footprint, depth, band_range)) => {
-                *slot = footprint;
-                (depth, band_range)
+    let lens = Lens::<S::Doubles>::new(view.camera);
+    let groups = footprints.chunks_mut(LANES).zip(depths.chunks_mut(LANES)).zip(bands.chunks_mut(LANES));
+    for (number, ((footprints, depths), bands)) in groups.enumerate() {
+        let first = number * LANES;
+        let mut directions = [[0.0; LANES]; 3];
+        let mut visible = 0;
+        let octets = footprints.chunks_mut(OCTET).zip(depths.chunks_mut(OCTET)).zip(bands.chunks_mut(OCTET));
+        for (half, ((footprints, depths), bands)) in octets.enumerate() {
+            let octet = Octet::project(&part, first + half * OCTET, &lens, &mut directions, half);
+            octet.store(footprints, depths, bands);
+            visible |= u16::from(octet.visible) << (half * OCTET);
+        }
+        if visible == 0 {
+            continue;
+        }
+        let coefficients = Coefficients::<S>::load(&part, first, view.sh_degree);
+        let (colours, are_finite) = coefficients.seen_along(&directions);
+        for (lane, footprint) in footprints.iter_mut().enumerate() {
+            footprint.colour = [colours[0][lane], colours[1][lane], colours[2][lane]];
+            if visible & !are_finite & 1 << lane != 0 {
+                (depths[lane], bands[lane]) = (f64::NAN, BandRange::default());
             }
-            None => (f64::NAN, BandRange::default()),
-        };
+        }
     }
 }
 
-#[inline(always)]
-fn footprint(gaussians: &Gaussians, index: usize, view: &View<'_>) -> Option<(Footprint, f64, BandRange)> {
-    let camera = view.camera;
-    let opacity = gaussians.opacity(index);
-    let log_opacity = opacity.ln();
-    let reach = log_opacity - f64::from(ALPHA_MIN).ln();
-    if !(reach >= 0.0) {
-        return None;
-    }
-    let local = local_projection(gaussians, index, camera)?;
-    let mean = [
-        camera.fx * local.camera.x / local.camera.z + camera.cx,
-        camera.fy * local.camera.y / local.camera.z + camera.cy,
-    ];
-    let [across, along] = local.spread;
-    let (xx, xy, yy) =
-        (across.length_squared() + LOW_PASS, across.dot(along), along.length_squared() + LOW_PASS);
-    let slope = xy / yy;
-    let conditional = conditional_variance(across, along, yy);
-    if !(mean[0].is_finite() && mean[1].is_finite() && xx.is_finite() && yy.is_finite() && conditional > 0.0)
-    {
-        return None;
-    }
-    let (half_width, half_height) = ((2.0 * reach * xx).sqrt(), (2.0 * reach * yy).sqrt());
-    let (width, height) = (f64::from(camera.width), f64::from(camera.height));
-    let outside = mean[0] + half_width < 0.5
-        || mean[0] - half_width > width - 0.5
-        || mean[1] + half_height < 0.5
-        || mean[1] - half_height > height - 0.5;
-    if outside {
-        return None;
-    }
-    let first_row = (mean[1] - half_height - 0.5).max(0.0) as usize;
-    let last_row = (mean[1] + half_height - 0.5).min(height - 1.0) as usize;
-    let colour = colour::seen_from(gaussians, index, view.centre, view.sh_degree);
-    if !colour.iter().all(|channel| channel.is_finite()) {
-        return None;
-    }
-    let bands = BandRange { first: (first_row / BAND_ROWS) as u32, end: (last_row / BAND_ROWS + 1) as u32 };
-    let footprint = Footprint {
-        mean,
-        slope,
-        conditional,
-        inverse_conditional: 1.0 / conditional,
-        inverse_yy: 1.0 / yy,
-        opacity,
-        log_opacity,
-        reach,
-        half_height,
-        row_of_rightmost: half_width * xy / xx,
-        colour,
+/// Eight footprints but for their colours, value by lane.
+struct Octet {
+    /// Bit `n` is set if lane `n` reaches a pixel; all else is meaningless where it is not.
+    visible: u8,
+    depth: [f64; OCTET],
+    mean: [[f64; OCTET]; 2],
+    slope: [f64; OCTET],
+    conditional: [f64; OCTET],
+    inverse_conditional: [f64; OCTET],
+    inverse_yy: [f64; OCTET],
+    opacity: [f64; OCTET],
+    log_opacity: [f64; OCTET],
+    reach: [f64; OCTET],
+    half_height: [f64; OCTET],
+    row_of_rightmost: [f64; OCTET],
+    /// Where the first and the last row lie, counted in bands.
+    ends: [[f64; OCTET]; 2],
+}
+
+impl Octet {
+    /// None of which reaches a pixel.
+    const EMPTY: Self = Self {
+        visible: 0,
+        depth: [f64::NAN; OCTET],
+        mean: [[0.0; OCTET]; 2],
+        slope: [0.0; OCTET],
+        conditional: [0.0; OCTET],
+        inverse_conditional: [0.0; OCTET],
+        inverse_yy: [0.0; OCTET],
+        opacity: [0.0; OCTET],
+        log_opacity: [0.0; OCTET],
+        reach: [0.0; OCTET],
+        half_height: [0.0; OCTET],
+        row_of_rightmost: [0.0; OCTET],
+        ends: [[0.0; OCTET]; 2],
     };
-    Some((footprint, local.camera.z, bands))
-}
 
-/// `cov_xx - cov_xy² / cov_yy` as a sum of non-negative terms (Lagrange's identity), exact for needles.
-#[inline(always)]
-pub(super) fn conditional_variance(across: DVec3, along: DVec3, yy: f64) -> f64 {
-    let unblurred = across.cross(along).length_squared() + LOW_PASS * across.length_squared();
-    LOW_PASS + unblurred / yy
+    /// The Gaussians from `first` on; the last of the part stands in for those beyond. Writes the directions that they are
+    /// seen in to lanes of `directions`, the lower or the upper `half`.
+    #[inline(always)]
+    fn project<D: Doubles>(
+        part: &Part<'_>,
+        first: usize,
+        lens: &Lens<D>,
+        directions: &mut Triple,
+        half: usize,
+    ) -> Self {
+        let (zero, one, two) = (D::splat(0.0), D::splat(1.0), D::splat(2.0));
+        let centre = D::splat(0.5);
+        let mut octet = Self::EMPTY;
+        let gaussians = Geometry::<D>::load(part, first);
+        let point = lens.to_camera(gaussians.mean);
+        let opacity = sigmoid(gaussians.logit_opacity);
+        let log_opacity = opacity.ln();
+        let reach = log_opacity - D::splat(ALPHA_MIN.into()).ln();
+        // Comparisons with NaN are false: what is no number is not drawn.
+        let mut visible = D::both(point.z.gt(D::splat(NEAR_PLANE)), reach.ge(zero));
+        if D::bits(visible) == 0 {
+            return octet;
+        }
+        let local = LocalProjection::new(&gaussians, point, lens);
+        let covariance = Covariance::new(local.spread);
+        let mean = local.mean(lens);
+        let (half_width, half_height) =
+            ((two * reach * covariance.xx).sqrt(), (two * reach * covariance.yy).sqrt());
+        for number in [mean[0], mean[1], covariance.xx, covariance.yy] {
+            visible = D::both(visible, number.is_finite());
+        }
+        visible = D::both(visible, covariance.conditional.gt(zero));
+        for (mean, reach, size) in [(mean[0], half_width, lens.size[0]), (mean[1], half_height, lens.size[1])]
+        {
+            visible = D::both(visible, (mean + reach).ge(centre));
+            visible = D::both(visible, (size - centre).ge(mean - reach));
+        }
+        octet.visible = D::bits(visible);
+        D::select(visible, point.z, D::splat(f64::NAN)).store(&mut octet.depth);
+        mean[0].store(&mut octet.mean[0]);
+        mean[1].store(&mut octet.mean[1]);
+        covariance.slope.store(&mut octet.slope);
+        covariance.conditional.store(&mut octet.conditional);
+        covariance.inverse_conditional.store(&mut octet.inverse_conditional);
+        covariance.inverse_yy.store(&mut octet.inverse_yy);
+        opacity.store(&mut octet.opacity);
+        log_opacity.store(&mut octet.log_opacity);
+        reach.store(&mut octet.reach);
+        half_height.store(&mut octet.half_height);
+        (half_width * covariance.xy / covariance.xx).store(&mut octet.row_of_rightmost);
+        let bands = D::splat(1.0 / BAND_ROWS as f64);
+        ((mean[1] - half_height - centre).max(zero) * bands).store(&mut octet.ends[0]);
+        ((mean[1] + half_height - centre).min(lens.size[1] - one) * bands).store(&mut octet.ends[1]);
+        store_direction(sight(gaussians.mean, lens).0, directions, half);
+        octet
+    }
+
+    /// Writes the Gaussians that there are, up to eight.
+    #[inline(always)]
+    fn store(&self, footprints: &mut [Footprint], depths: &mut [f64], bands: &mut [BandRange]) {
+        depths.copy_from_slice(&self.depth[..depths.len()]);
+        for (lane, (footprint, bands)) in footprints.iter_mut().zip(bands).enumerate() {
+            if self.visible >> lane & 1 == 0 {
+                *bands = BandRange::default();
+                continue;
+            }
+            let [first, last] = [self.ends[0][lane] as u32, self.ends[1][lane] as u32];
+            *bands = BandRange { first, end: last + 1 };
+            *footprint = Footprint {
+                mean: [self.mean[0][lane], self.mean[1][lane]],
+                slope: self.slope[lane],
+                conditional: self.conditional[lane],
+                inverse_conditional: self.inverse_conditional[lane],
+                inverse_yy: self.inverse_yy[lane],
+                opacity: self.opacity[lane],
+                log_opacity: self.log_opacity[lane],
+                reach: self.reach[lane],
+                half_height: self.half_height[lane],
+                row_of_rightmost: self.row_of_rightmost[lane],
+                colour: [0.0; 3],
+            };
+        }
+    }
 }

@@ -1,271 +1,326 @@
-//! Stage 5: from the gradient of a footprint to the gradient of the Gaussian's parameters, in f64.
+//! Stage 5: from the gradient of a footprint to the gradient of the Gaussian's parameters, eight Gaussians at a time in f64.
 
-use glam::{DMat3, DVec3};
+use std::ops::Range;
 
 use super::{
     bin::Bins,
     blend::Band,
-    blend_backward::FootprintGradient,
-    colour,
-    project::{Footprint, LocalProjection, View, local_projection},
+    colour::{Coefficients, Triple},
+    lanes::{Geometry, Vector, combine, load_means, sigmoid, store_rows},
+    local::{Covariance, Lens, LocalProjection, View, load_direction, sight, store_direction},
 };
 use crate::{
-    cameras::Camera,
-    gaussians::Gaussians,
-    simd::{Simd, prefetch, simd_kernel},
+    gaussians::part::{Part, PartMut},
+    simd::{Doubles, LANES, OCTET, Simd, prefetch, simd_kernel},
 };
 
-/// Gaussians whose sums are asked for ahead.
-const AHEAD: usize = 4;
+/// Values of [`Sums`](super::blend_backward::Sums) that are of use.
+const SUMS: usize = 9;
 
-/// Gradients of consecutive Gaussians by their parameters, of the shapes of `GaussianGradients`.
-pub(super) struct GradientChunk<'a> {
-    pub means: &'a mut [[f32; 3]],
-    pub rotations: &'a mut [[f32; 4]],
-    pub log_scales: &'a mut [[f32; 3]],
-    pub logit_opacities: &'a mut [f32],
-    pub sh: &'a mut [f32],
-    /// By the projected mean, per pixel.
-    pub projected_means: &'a mut [[f32; 2]],
+/// What the gradients of the Gaussians of a view start from.
+pub(super) struct Backward<'a> {
+    pub view: View<'a>,
+    pub bins: &'a Bins,
+    pub bands: &'a [Band],
+    /// Empty: all are.
+    pub active: &'a [bool],
 }
 
-impl GradientChunk<'_> {
+impl Backward<'_> {
+    /// Of up to sixteen Gaussians from `first` on, those that need a gradient: bit `n` is that of Gaussian `first + n`.
     #[inline(always)]
-    fn set(&mut self, place: usize, geometry: &GeometryGradient) {
-        self.means[place] = geometry.mean;
-        self.rotations[place] = geometry.rotation;
-        self.log_scales[place] = geometry.log_scale;
-        self.logit_opacities[place] = geometry.logit_opacity;
-        self.projected_means[place] = geometry.projected_mean;
+    fn wanted(&self, first: usize, count: usize) -> u16 {
+        let mut wanted = 0;
+        for lane in 0..count {
+            let is_active = self.active.get(first + lane).copied().unwrap_or(true);
+            wanted |= u16::from(is_active & self.bins.projection.is_visible(first + lane)) << lane;
+        }
+        wanted
+    }
+
+    /// Bands keep their sums in depth order, which is no order in memory.
+    #[inline(always)]
+    fn prefetch_sums(&self, indices: Range<usize>) {
+        for index in indices {
+            let (first_band, places) = self.bins.places_of(index);
+            for (band, &place) in self.bands[first_band..].iter().zip(places) {
+                let sums = &band.sums[place as usize];
+                prefetch(&sums[0]);
+                prefetch(&sums[8]);
+            }
+        }
+    }
+
+    /// Sums over the bands of the Gaussians of `wanted`, from `first` on, value by lane; zero for the others.
+    #[inline(always)]
+    fn sums(&self, first: usize, wanted: u16) -> [[f64; LANES]; SUMS] {
+        let mut by_value = [[0.0; LANES]; SUMS];
+        for lane in 0..LANES {
+            if wanted >> lane & 1 == 0 {
+                continue;
+            }
+            let mut total = [0.0; 12];
+            let (first_band, places) = self.bins.places_of(first + lane);
+            for (band, &place) in self.bands[first_band..].iter().zip(places) {
+                let sums = &band.sums[place as usize];
+                for value in 0..12 {
+                    total[value] += f64::from(sums[value]);
+                }
+            }
+            for (values, total) in by_value.iter_mut().zip(total) {
+                values[lane] = total;
+            }
+        }
+        by_value
     }
 }
 
 simd_kernel! {
-    /// Writes the gradients of the Gaussians from `first` on; zero for those that the view does not show or that are not
-    /// `active` (empty: all are).
+    /// Writes the gradients of the Gaussians of a part, the first of which is number `first` of the view, and those by
+    /// their projected means, per pixel; zero for those that the view does not show or that are not active.
     pub(super) fn project_backward(
-        gaussians: &Gaussians,
-        bins: &Bins,
-        bands: &[Band],
-        view: &View<'_>,
-        active: &[bool],
+        part: Part<'_>,
+        backward: &Backward<'_>,
         first: usize,
-        gradients: GradientChunk<'_>,
+        gradients: PartMut<'_>,
+        projected_means: &mut [[f32; 2]],
     ) = project_backward_kernel
 }
 
 #[inline(always)]
 fn project_backward_kernel<S: Simd>(
-    gaussians: &Gaussians,
-    bins: &Bins,
-    bands: &[Band],
-    view: &View<'_>,
-    active: &[bool],
+    part: Part<'_>,
+    backward: &Backward<'_>,
     first: usize,
-    mut gradients: GradientChunk<'_>,
+    mut gradients: PartMut<'_>,
+    projected_means: &mut [[f32; 2]],
 ) {
-    let stride = gaussians.sh_coefficients() * 3;
-    let count = gradients.means.len();
-    for place in 0..count {
-        let index = first + place;
-        prefetch_sums(bins, bands, first + (place + AHEAD).min(count - 1));
-        let footprint = &bins.projection.footprints[index];
-        let is_wanted = bins.projection.is_visible(index) && active.get(index).copied().unwrap_or(true);
-        let mut geometry = GeometryGradient::default();
-        if is_wanted {
-            let gradient = sum_over_bands(bins, bands, index);
-            let sh = &mut gradients.sh[place * stride..(place + 1) * stride];
-            geometry = gradient_of(gaussians, index, footprint, view, &gradient, sh);
-        }
-        // Beyond single precision there is no direction to follow; a step of infinity would spread.
-        if !(is_wanted && geometry.is_finite()) {
-            geometry = GeometryGradient::default();
-            gradients.sh[place * stride..(place + 1) * stride].fill(0.0);
-        }
-        gradients.set(place, &geometry);
+    let lens = Lens::<S::Doubles>::new(backward.view.camera);
+    let count = part.len();
+    for place in (0..count).step_by(LANES) {
+        let end = count.min(place + LANES);
+        backward.prefetch_sums(first + end..first + count.min(end + LANES));
+        let gradients = gradients.slice(place..end);
+        let projected_means = &mut projected_means[place..end];
+        group_backward::<S>(&part, place, backward, first + place, &lens, gradients, projected_means);
     }
 }
 
-/// Bands keep their sums in depth order, which is no order in memory.
+/// Up to sixteen Gaussians, from `place` on in the part and from `index` on in the view.
 #[inline(always)]
-fn prefetch_sums(bins: &Bins, bands: &[Band], index: usize) {
-    let (first_band, places) = bins.places_of(index);
-    for (band, &place) in bands[first_band..].iter().zip(places) {
-        prefetch(&band.sums[place as usize]);
-    }
-}
-
-#[inline(always)]
-fn sum_over_bands(bins: &Bins, bands: &[Band], index: usize) -> FootprintGradient {
-    let mut gradient = FootprintGradient::default();
-    let (first_band, places) = bins.places_of(index);
-    for (band, &place) in bands[first_band..].iter().zip(places) {
-        gradient.add(&band.sums[place as usize]);
-    }
-    gradient
-}
-
-/// Gradient of the loss by the geometry of one Gaussian.
-#[derive(Clone, Copy, Debug, Default)]
-struct GeometryGradient {
-    /// By the world mean.
-    mean: [f32; 3],
-    /// By the stored quaternion `w, x, y, z`.
-    rotation: [f32; 4],
-    /// By the logarithm of the scales.
-    log_scale: [f32; 3],
-    /// By the logit of the opacity.
-    logit_opacity: f32,
-    /// By the projected mean, per pixel.
-    projected_mean: [f32; 2],
-    /// By the colour; every spherical-harmonic gradient is a share of it.
-    colour: [f32; 3],
-}
-
-impl GeometryGradient {
-    #[inline(always)]
-    fn is_finite(&self) -> bool {
-        let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
-        finite(&self.mean)
-            && finite(&self.rotation)
-            && finite(&self.log_scale)
-            && self.logit_opacity.is_finite()
-            && finite(&self.projected_mean)
-            && finite(&self.colour)
-    }
-}
-
-/// Turns the gradient of a footprint into that of its Gaussian, number `index`; writes the colour's share to
-/// `sh_gradient` (`K × 3`).
-#[inline(always)]
-fn gradient_of(
-    gaussians: &Gaussians,
+fn group_backward<S: Simd>(
+    part: &Part<'_>,
+    place: usize,
+    backward: &Backward<'_>,
     index: usize,
-    footprint: &Footprint,
-    view: &View<'_>,
-    gradient: &FootprintGradient,
-    sh_gradient: &mut [f32],
-) -> GeometryGradient {
-    let camera = view.camera;
-    let Some(local) = local_projection(gaussians, index, camera) else {
-        sh_gradient.fill(0.0);
-        return GeometryGradient::default();
-    };
-    let projected_mean = mean_gradient(footprint, gradient);
-    let spread = spread_gradient(footprint, gradient, &local);
-    let rows = [local.axes * spread[0], local.axes * spread[1]];
-    let in_camera = camera_gradient(camera, &local, projected_mean, rows);
-    let [red, green, blue] = gradient.colour;
-    let colour = [red as f32, green as f32, blue as f32];
-    let from_colour = colour::backward(gaussians, index, view.centre, view.sh_degree, colour, sh_gradient);
-    let mean = camera.rotation.transpose() * in_camera + from_colour;
-    let axes = outer(local.rows[0], spread[0]) + outer(local.rows[1], spread[1]);
-    let (log_scale, [w, x, y, z]) = axes_gradient(gaussians, index, &local, axes);
-    GeometryGradient {
-        mean: mean.as_vec3().to_array(),
-        rotation: [w as f32, x as f32, y as f32, z as f32],
-        log_scale: log_scale.as_vec3().to_array(),
-        logit_opacity: (gradient.v * (1.0 - footprint.opacity)) as f32,
-        projected_mean: [projected_mean[0] as f32, projected_mean[1] as f32],
-        colour,
+    lens: &Lens<S::Doubles>,
+    mut gradients: PartMut<'_>,
+    projected_means: &mut [[f32; 2]],
+) {
+    let wanted = backward.wanted(index, projected_means.len());
+    let sums = backward.sums(index, wanted);
+    let mut directions = [[0.0; LANES]; 3];
+    for half in 0..LANES / OCTET {
+        let mean = load_means::<S::Doubles>(part, place + half * OCTET);
+        store_direction(sight(mean, lens).0, &mut directions, half);
+    }
+    let coefficients = Coefficients::<S>::load(part, place, backward.view.sh_degree);
+    let mut by_colour = [[0.0; LANES]; 3];
+    for (to, sums) in by_colour.iter_mut().zip(&sums[6..]) {
+        for lane in 0..LANES {
+            to[lane] = sums[lane] as f32;
+        }
+    }
+    let (by_coefficients, by_direction) = coefficients.backward(&directions, &by_colour);
+    let mut kept = 0;
+    for (half, projected_means) in projected_means.chunks_mut(OCTET).enumerate() {
+        let first = half * OCTET;
+        let sums = FootprintGradient::<S::Doubles>::new(&sums, half);
+        let gaussians = Geometry::load(part, place + first);
+        let gradient = Gradient::new(&gaussians, &sums, &by_direction, half, lens);
+        let finite = gradient.fits_single() & (wanted >> first) as u8;
+        gradient.store(finite, gradients.slice(first..first + projected_means.len()), projected_means);
+        kept |= u16::from(finite) << first;
+    }
+    by_coefficients.store(gradients.sh, part.sh_stride(), kept);
+}
+
+/// Gradient of the loss by eight footprints.
+///
+/// With `v = alpha · ∂loss/∂alpha`, `d` the offset from the row centre and `dy` that from the mean's row, the moments of
+/// `v` suffice for the footprint's position and shape.
+struct FootprintGradient<D> {
+    /// `Σ v`: by the logarithm of the opacity.
+    v: D,
+    /// `Σ v d`.
+    v_d: D,
+    /// `Σ v d²`.
+    v_dd: D,
+    /// `Σ v dy`.
+    v_y: D,
+    /// `Σ v d dy`.
+    v_dy: D,
+    /// `Σ v dy²`.
+    v_yy: D,
+    /// By the colour.
+    colour: [D; 3],
+}
+
+impl<D: Doubles> FootprintGradient<D> {
+    /// Of the lower or the upper `half` of sixteen lanes.
+    #[inline(always)]
+    fn new(sums: &[[f64; LANES]; SUMS], half: usize) -> Self {
+        let load = |value: usize| D::load(&sums[value].as_chunks().0[half]);
+        Self {
+            v: load(0),
+            v_d: load(1),
+            v_dd: load(2),
+            v_y: load(3),
+            v_dy: load(4),
+            v_yy: load(5),
+            colour: [load(6), load(7), load(8)],
+        }
     }
 }
 
-#[inline(always)]
-fn outer(column: DVec3, row: DVec3) -> DMat3 {
-    DMat3::from_cols(column * row.x, column * row.y, column * row.z)
+/// Gradients of the loss by the parameters of eight Gaussians, but for their coefficients.
+struct Gradient<D> {
+    /// By the world mean.
+    mean: Vector<D>,
+    /// By the stored quaternion `w, x, y, z`.
+    rotation: [D; 4],
+    /// By the logarithm of the scales.
+    log_scale: [D; 3],
+    /// By the logit of the opacity.
+    logit_opacity: D,
+    /// By the projected mean, per pixel.
+    projected_mean: [D; 2],
+    /// By the colour; every gradient by a coefficient is a share of it.
+    colour: [D; 3],
+}
+
+impl<D: Doubles> Gradient<D> {
+    /// From the gradient by the footprint, and through the colour that by the direction, of which the lower or the upper
+    /// `half` of the lanes.
+    #[inline(always)]
+    fn new(
+        gaussians: &Geometry<D>,
+        gradient: &FootprintGradient<D>,
+        by_direction: &Triple,
+        half: usize,
+        lens: &Lens<D>,
+    ) -> Self {
+        let point = lens.to_camera(gaussians.mean);
+        let local = LocalProjection::new(gaussians, point, lens);
+        let covariance = Covariance::new(local.spread);
+        let projected_mean = mean_gradient(&covariance, gradient);
+        let spread = spread_gradient(&covariance, gradient, &local);
+        let rows = [combine(&local.axes, spread[0]), combine(&local.axes, spread[1])];
+        let in_camera = camera_gradient(&local, lens, projected_mean, rows);
+        let (log_scale, rotation) = axes_gradient(&local, spread);
+        let (direction, inverse_distance) = sight(gaussians.mean, lens);
+        let by_direction = load_direction(by_direction, half);
+        let across = direction.scaled_plus(-direction.dot(by_direction), by_direction);
+        Self {
+            mean: across.scaled_plus(inverse_distance, combine(&lens.axes, in_camera)),
+            rotation,
+            log_scale,
+            logit_opacity: gradient.v * sigmoid(-gaussians.logit_opacity),
+            projected_mean,
+            colour: gradient.colour,
+        }
+    }
+
+    /// The lanes in which all is finite in single precision. Beyond that there is no direction to follow; a step of
+    /// infinity would spread.
+    #[inline(always)]
+    fn fits_single(&self) -> u8 {
+        let [w, x, y, z] = self.rotation;
+        let [a, b, c] = self.log_scale;
+        let [u, v] = self.projected_mean;
+        let [red, green, blue] = self.colour;
+        let Vector { x: p, y: q, z: r } = self.mean;
+        let mut fits = self.logit_opacity.fits_single();
+        for value in [w, x, y, z, a, b, c, u, v, red, green, blue, p, q, r] {
+            fits = D::both(fits, value.fits_single());
+        }
+        D::bits(fits)
+    }
+
+    /// Writes up to eight rows; zeros where bits of `kept` are.
+    #[inline(always)]
+    fn store(&self, kept: u8, to: PartMut<'_>, projected_means: &mut [[f32; 2]]) {
+        store_rows([self.mean.x, self.mean.y, self.mean.z], kept, to.means);
+        store_rows(self.rotation, kept, to.rotations);
+        store_rows(self.log_scale, kept, to.log_scales);
+        store_rows([self.logit_opacity], kept, to.logit_opacities.as_chunks_mut().0);
+        store_rows(self.projected_mean, kept, projected_means);
+    }
 }
 
 /// By the projected mean: alpha's exponent falls with `d` along the row and with `dy` across.
 #[inline(always)]
-fn mean_gradient(footprint: &Footprint, gradient: &FootprintGradient) -> [f64; 2] {
-    let x = footprint.inverse_conditional * gradient.v_d;
-    let y = -footprint.slope * x + footprint.inverse_yy * gradient.v_y;
-    [x, y]
+fn mean_gradient<D: Doubles>(covariance: &Covariance<D>, gradient: &FootprintGradient<D>) -> [D; 2] {
+    let x = covariance.inverse_conditional * gradient.v_d;
+    [x, covariance.inverse_yy.mul_sub(gradient.v_y, covariance.slope * x)]
 }
 
 /// By the two rows of `J W R diag(exp(s))`, through `inverse_conditional`, `slope` and `inverse_yy`.
 #[inline(always)]
-fn spread_gradient(
-    footprint: &Footprint,
-    gradient: &FootprintGradient,
-    local: &LocalProjection,
-) -> [DVec3; 2] {
-    let (k, s) = (footprint.inverse_conditional, footprint.slope);
-    let by_conditional = -0.5 * gradient.v_dd;
-    let by_slope = k * gradient.v_dy;
-    let by_yy_alone = 0.5 * gradient.v_yy * footprint.inverse_yy * footprint.inverse_yy;
+fn spread_gradient<D: Doubles>(
+    covariance: &Covariance<D>,
+    gradient: &FootprintGradient<D>,
+    local: &LocalProjection<D>,
+) -> [Vector<D>; 2] {
+    let (half, two) = (D::splat(0.5), D::splat(2.0));
+    let (k, s, inverse_yy) = (covariance.inverse_conditional, covariance.slope, covariance.inverse_yy);
     // k = 1 / (xx - xy² / yy) and s = xy / yy.
-    let xx = -k * k * by_conditional;
-    let xy = 2.0 * k * k * s * by_conditional + footprint.inverse_yy * by_slope;
-    let yy = -k * k * s * s * by_conditional - s * footprint.inverse_yy * by_slope + by_yy_alone;
+    let xx = half * k * k * gradient.v_dd;
+    let by_slope = inverse_yy * (k * gradient.v_dy);
+    let xy = by_slope - two * s * xx;
+    let yy = s * (s * xx - by_slope) + half * gradient.v_yy * (inverse_yy * inverse_yy);
     let [across, along] = local.spread;
-    [across * (2.0 * xx) + along * xy, across * xy + along * (2.0 * yy)]
+    [across.scaled_plus(two * xx, along * xy), along.scaled_plus(two * yy, across * xy)]
 }
 
-/// By the mean in camera axes, through the projected mean and through the Jacobian's entries.
+/// By the mean in camera axes, through the projected mean and through the Jacobian's entries; `rows` is the gradient by
+/// the rows of `J W`.
 #[inline(always)]
-fn camera_gradient(camera: &Camera, local: &LocalProjection, mean: [f64; 2], rows: [DVec3; 2]) -> DVec3 {
-    let inverse_z = 1.0 / local.camera.z;
-    let jacobian = [camera.rotation * rows[0], camera.rotation * rows[1]];
-    let position = [local.camera.x, local.camera.y];
-    let focal = [camera.fx, camera.fy];
-    let mut gradient = DVec3::ZERO;
-    for axis in 0..2 {
-        let scale = focal[axis] * inverse_z;
-        gradient[axis] += mean[axis] * scale;
-        gradient.z -= mean[axis] * scale * position[axis] * inverse_z;
+fn camera_gradient<D: Doubles>(
+    local: &LocalProjection<D>,
+    lens: &Lens<D>,
+    mean: [D; 2],
+    rows: [Vector<D>; 2],
+) -> Vector<D> {
+    let [right, down, forward] = lens.axes;
+    let mut along = [D::splat(0.0); 2];
+    let mut towards = D::splat(0.0);
+    for (axis, of_camera) in [right, down].into_iter().enumerate() {
+        let scale = lens.focal[axis] * local.inverse_z;
         // J[axis][axis] = f / z and J[axis][z] = -f · slope / z.
-        gradient.z -= jacobian[axis][axis] * scale * inverse_z;
-        let by_z_entry = jacobian[axis].z * scale;
-        gradient.z += by_z_entry * local.slope[axis] * inverse_z;
-        if !local.clamped[axis] {
-            gradient[axis] -= by_z_entry * inverse_z;
-            gradient.z += by_z_entry * local.slope[axis] * inverse_z;
-        }
+        let by_diagonal = rows[axis].dot(of_camera) * local.inverse_z;
+        let by_slope = rows[axis].dot(forward) * local.inverse_z;
+        let through_slope = by_slope * local.unclamped[axis];
+        along[axis] = scale * (mean[axis] - through_slope);
+        let by_depth = local.slope[axis] * (by_slope + through_slope);
+        towards = towards + scale * (by_depth - mean[axis] * local.direction[axis] - by_diagonal);
     }
-    gradient
+    let [x, y] = along;
+    Vector { x, y, z: towards }
 }
 
-/// By log scales and quaternion, from the gradient by `R diag(exp(s))`.
+/// By log scales and quaternion, from the gradient by the rows of `J W R diag(exp(s))`.
 #[inline(always)]
-fn axes_gradient(
-    gaussians: &Gaussians,
-    index: usize,
-    local: &LocalProjection,
-    axes: DMat3,
-) -> (DVec3, [f64; 4]) {
-    let log_scale = DVec3::new(
-        axes.x_axis.dot(local.axes.x_axis),
-        axes.y_axis.dot(local.axes.y_axis),
-        axes.z_axis.dot(local.axes.z_axis),
-    );
-    let scale = gaussians.log_scales[index].map(|value| f64::from(value).exp());
-    let by_rotation =
-        DMat3::from_cols(axes.x_axis * scale[0], axes.y_axis * scale[1], axes.z_axis * scale[2]);
-    (log_scale, quaternion_gradient(gaussians, index, by_rotation))
-}
-
-#[inline(always)]
-fn quaternion_gradient(gaussians: &Gaussians, index: usize, g: DMat3) -> [f64; 4] {
-    let q = gaussians.rotation(index);
-    let (w, x, y, z) = (q.w, q.x, q.y, q.z);
-    // g.col(c)[r] is the gradient by entry (r, c) of the rotation matrix.
-    let at = |row: usize, column: usize| g.col(column)[row];
-    let by_unit = [
-        2.0 * (z * (at(1, 0) - at(0, 1)) + y * (at(0, 2) - at(2, 0)) + x * (at(2, 1) - at(1, 2))),
-        2.0 * (y * (at(0, 1) + at(1, 0)) + z * (at(0, 2) + at(2, 0)) + w * (at(2, 1) - at(1, 2)))
-            - 4.0 * x * (at(1, 1) + at(2, 2)),
-        2.0 * (x * (at(0, 1) + at(1, 0)) + z * (at(1, 2) + at(2, 1)) + w * (at(0, 2) - at(2, 0)))
-            - 4.0 * y * (at(0, 0) + at(2, 2)),
-        2.0 * (x * (at(0, 2) + at(2, 0)) + y * (at(1, 2) + at(2, 1)) + w * (at(1, 0) - at(0, 1)))
-            - 4.0 * z * (at(0, 0) + at(1, 1)),
+fn axes_gradient<D: Doubles>(local: &LocalProjection<D>, spread: [Vector<D>; 2]) -> ([D; 3], [D; 4]) {
+    let [across, along] = local.rows;
+    let by_axis = |a: D, b: D| across.scaled_plus(a, along * b);
+    let axes = [
+        by_axis(spread[0].x, spread[1].x),
+        by_axis(spread[0].y, spread[1].y),
+        by_axis(spread[0].z, spread[1].z),
     ];
-    let unit = [w, x, y, z];
-    let along: f64 = (0..4).map(|i| unit[i] * by_unit[i]).sum();
-    let norm = gaussians.rotations[index].iter().map(|&value| f64::from(value).powi(2)).sum::<f64>().sqrt();
-    if !(norm > 0.0 && norm.is_finite()) {
-        return [0.0; 4];
-    }
-    std::array::from_fn(|i| (by_unit[i] - unit[i] * along) / norm)
+    let [x, y, z] = axes;
+    let log_scale = [x.dot(local.axes[0]), y.dot(local.axes[1]), z.dot(local.axes[2])];
+    let [a, b, c] = local.scale;
+    (log_scale, local.rotation.gradient(&[x * a, y * b, z * c]))
 }

@@ -1,10 +1,11 @@
-//! Sixteen numbers at a time, and the choice of instruction set at run time.
+//! Sixteen single-precision or eight double-precision numbers at a time, and the choice of instruction set at run time.
 //!
 //! Kernels are written once, generic over [`Simd`]. [`simd_kernel!`] compiles such a kernel for AVX-512, for AVX2 + FMA
 //! and for plain arrays, which the compiler turns into the baseline's instructions (SSE2, NEON). AVX-512 and AVX2 give
 //! the same bytes; the baseline of x86 rounds after every multiplication where they round once after a fused
 //! multiplication and addition.
 
+mod doubles;
 mod instructions;
 mod plain;
 #[cfg(test)]
@@ -12,6 +13,7 @@ mod tests;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
+pub(crate) use self::doubles::{Doubles, OCTET};
 pub use self::instructions::{InstructionSet, Instructions, Unavailable};
 pub(crate) use self::plain::Plain;
 #[cfg(target_arch = "x86_64")]
@@ -36,6 +38,8 @@ pub(crate) struct Group(pub [f32; LANES]);
 pub(crate) trait Simd: Copy {
     /// One flag per lane.
     type Mask: Copy;
+    /// Double precision with the same instructions.
+    type Doubles: Doubles;
     fn splat(value: f32) -> Self;
     fn load(from: &[f32; LANES]) -> Self;
     fn store(self, to: &mut [f32; LANES]);
@@ -59,6 +63,8 @@ pub(crate) trait Simd: Copy {
     fn lt(self, other: Self) -> Self::Mask;
     fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
     fn any(mask: Self::Mask) -> bool;
+    /// Bit `n` is the flag of lane `n`.
+    fn bits(mask: Self::Mask) -> u16;
     /// `yes` where the flag is set, else `no`.
     fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
     /// Adds the low bits of `rounded` to the exponent of `self`.
@@ -66,6 +72,8 @@ pub(crate) trait Simd: Copy {
 
     /// Row `r` of the result holds row `r` of each argument, a row being lanes 0 to 3, 4 to 7, 8 to 11 or 12 to 15.
     fn transpose(arguments: [Self; ROWS]) -> [Self; ROWS];
+    /// Lane `l` of a row of result `r` is lane `r` of that row of argument `l`.
+    fn transpose_rows(arguments: [Self; ROWS]) -> [Self; ROWS];
     /// In each row, the sum of that row of each argument, taken as `(0 + 2) + (1 + 3)`.
     fn row_sums(arguments: [Self; ROWS]) -> Self;
 
@@ -77,6 +85,22 @@ pub(crate) trait Simd: Copy {
     /// Writes the numbers from `first` on of those `words` that have one of the bits of `mask`, ascending, and returns
     /// how many. The rest of `to` is overwritten with anything.
     fn positions(words: &[u32; LANES], mask: u32, first: u32, to: &mut [u32; LANES]) -> usize;
+
+    /// Lane `l` of result `r` is lane `r` of argument `l`.
+    #[inline(always)]
+    fn transpose_lanes(arguments: [Self; LANES]) -> [Self; LANES] {
+        let mut results = arguments;
+        for four in results.as_chunks_mut::<ROWS>().0 {
+            *four = Self::transpose_rows(*four);
+        }
+        let halfway = results;
+        for at in 0..ROWS {
+            let four = [halfway[at], halfway[at + 4], halfway[at + 8], halfway[at + 12]];
+            let [a, b, c, d] = Self::transpose(four);
+            (results[at], results[at + 4], results[at + 8], results[at + 12]) = (a, b, c, d);
+        }
+        results
+    }
 
     /// `2^x` for `-126 ≤ x ≤ 127`, relative error below 2.5e-7; anything for other arguments.
     ///

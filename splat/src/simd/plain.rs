@@ -1,6 +1,6 @@
 //! Plain arrays.
 
-use super::{LANES, ROWS, Simd};
+use super::{LANES, ROWS, Simd, doubles::PlainDoubles};
 
 /// Plain arrays, for machines without the instruction sets below and for reference.
 #[derive(Clone, Copy)]
@@ -15,6 +15,7 @@ impl Plain {
 
 impl Simd for Plain {
     type Mask = [bool; LANES];
+    type Doubles = PlainDoubles;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self([value; LANES])
@@ -88,6 +89,10 @@ impl Simd for Plain {
         mask.contains(&true)
     }
     #[inline(always)]
+    fn bits(mask: Self::Mask) -> u16 {
+        (0..LANES).fold(0, |bits, lane| bits | u16::from(mask[lane]) << lane)
+    }
+    #[inline(always)]
     fn select(mask: Self::Mask, yes: Self, no: Self) -> Self {
         Self(std::array::from_fn(|lane| if mask[lane] { yes.0[lane] } else { no.0[lane] }))
     }
@@ -122,6 +127,13 @@ impl Simd for Plain {
             count += usize::from(word & mask != 0);
         }
         count
+    }
+
+    #[inline(always)]
+    fn transpose_rows(arguments: [Self; ROWS]) -> [Self; ROWS] {
+        std::array::from_fn(|result| {
+            Self(std::array::from_fn(|lane| arguments[lane % ROWS].0[lane - lane % ROWS + result]))
+        })
     }
 
     #[inline(always)]

@@ -53,6 +53,8 @@ fn same_as_plain<S: Simd>() {
         S::select(S::both(s.ge(t), s.lt(S::splat(9.0))), s, t),
         Plain::select(Plain::both(p.ge(q), p.lt(Plain::splat(9.0))), p, q),
     );
+    assert_eq!(S::bits(s.ge(t)), Plain::bits(p.ge(q)));
+    assert_eq!(S::bits(s.ge(S::splat(12.0))), 0b1000_0000_0000_0000);
     assert_eq!(S::any(s.ge(S::splat(100.0))), Plain::any(p.ge(Plain::splat(100.0))), "none");
     assert_eq!(S::any(s.ge(S::splat(12.0))), Plain::any(p.ge(Plain::splat(12.0))), "one lane");
     run("sqrt", s.mul(s).sqrt(), p.mul(p).sqrt());
@@ -65,6 +67,16 @@ fn same_as_plain<S: Simd>() {
     // The order of the sums is part of the contract: bit for bit.
     let (f, g) = ([s, t, s.add(t), s.mul(t)], [p, q, p.add(q), p.mul(q)]);
     assert_eq!(S::transpose(f).map(lanes), Plain::transpose(g).map(lanes));
+    assert_eq!(S::transpose_rows(f).map(lanes), Plain::transpose_rows(g).map(lanes));
+    assert_eq!(lanes(S::transpose_rows([s, t, s, t])[2])[..5], [a[2], b[2], a[2], b[2], a[6]]);
+    let mut rows = [s; LANES];
+    for (row, values) in rows.iter_mut().enumerate() {
+        *values = S::splat(100.0 * row as f32).add(s);
+    }
+    for (column, values) in S::transpose_lanes(rows).into_iter().enumerate() {
+        let expected: [f32; LANES] = std::array::from_fn(|row| 100.0 * row as f32 + a[column]);
+        assert_eq!(lanes(values), expected, "column {column}");
+    }
     assert_eq!(lanes(S::row_sums(f)), lanes(Plain::row_sums(g)));
     run("negated_mul_add", s.negated_mul_add(t, s), p.negated_mul_add(q, p));
     let rows = [[1.0, 2.0, 3.0, 4.0], [5.0; 4], [-1.0, 0.5, 0.25, 8.0], [0.0, 1.0, 0.0, 2.0]];

@@ -2,7 +2,10 @@
 
 use std::arch::x86_64::*;
 
-use super::{LANES, Plain, ROWS, Simd};
+use super::{
+    LANES, Plain, ROWS, Simd,
+    doubles::{Avx2Doubles, Avx512Doubles},
+};
 
 /// One 512-bit register.
 #[derive(Clone, Copy)]
@@ -23,6 +26,7 @@ macro_rules! intrinsic {
 
 impl Simd for Avx512 {
     type Mask = __mmask16;
+    type Doubles = Avx512Doubles;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self(intrinsic!(_mm512_set1_ps(value)))
@@ -122,6 +126,10 @@ impl Simd for Avx512 {
         a & b
     }
     #[inline(always)]
+    fn bits(mask: Self::Mask) -> u16 {
+        mask
+    }
+    #[inline(always)]
     fn any(mask: Self::Mask) -> bool {
         mask != 0
     }
@@ -137,6 +145,19 @@ impl Simd for Avx512 {
                 Self(_mm512_shuffle_f32x4::<0xDD>(ab_upper, cd_upper)),
                 Self(_mm512_shuffle_f32x4::<0x88>(ab_lower, cd_lower)),
                 Self(_mm512_shuffle_f32x4::<0xDD>(ab_lower, cd_lower)),
+            ]
+        })
+    }
+    #[inline(always)]
+    fn transpose_rows([a, b, c, d]: [Self; ROWS]) -> [Self; ROWS] {
+        intrinsic!({
+            let (ab_low, ab_high) = (_mm512_unpacklo_ps(a.0, b.0), _mm512_unpackhi_ps(a.0, b.0));
+            let (cd_low, cd_high) = (_mm512_unpacklo_ps(c.0, d.0), _mm512_unpackhi_ps(c.0, d.0));
+            [
+                Self(_mm512_shuffle_ps::<0x44>(ab_low, cd_low)),
+                Self(_mm512_shuffle_ps::<0xEE>(ab_low, cd_low)),
+                Self(_mm512_shuffle_ps::<0x44>(ab_high, cd_high)),
+                Self(_mm512_shuffle_ps::<0xEE>(ab_high, cd_high)),
             ]
         })
     }
@@ -177,6 +198,7 @@ impl Avx2 {
 
 impl Simd for Avx2 {
     type Mask = (__m256, __m256);
+    type Doubles = Avx2Doubles;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         let half = intrinsic!(_mm256_set1_ps(value));
@@ -293,6 +315,23 @@ impl Simd for Avx2 {
         })
     }
     #[inline(always)]
+    fn transpose_rows([a, b, c, d]: [Self; ROWS]) -> [Self; ROWS] {
+        let half = |a, b, c, d| {
+            intrinsic!({
+                let (ab_low, ab_high) = (_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
+                let (cd_low, cd_high) = (_mm256_unpacklo_ps(c, d), _mm256_unpackhi_ps(c, d));
+                [
+                    _mm256_shuffle_ps::<0x44>(ab_low, cd_low),
+                    _mm256_shuffle_ps::<0xEE>(ab_low, cd_low),
+                    _mm256_shuffle_ps::<0x44>(ab_high, cd_high),
+                    _mm256_shuffle_ps::<0xEE>(ab_high, cd_high),
+                ]
+            })
+        };
+        let (low, high) = (half(a.0, b.0, c.0, d.0), half(a.1, b.1, c.1, d.1));
+        [Self(low[0], high[0]), Self(low[1], high[1]), Self(low[2], high[2]), Self(low[3], high[3])]
+    }
+    #[inline(always)]
     fn row_sums([a, b, c, d]: [Self; ROWS]) -> Self {
         let half = |a, b, c, d| {
             intrinsic!({
@@ -302,6 +341,10 @@ impl Simd for Avx2 {
             })
         };
         Self(half(a.0, b.0, c.0, d.0), half(a.1, b.1, c.1, d.1))
+    }
+    #[inline(always)]
+    fn bits(mask: Self::Mask) -> u16 {
+        (intrinsic!(_mm256_movemask_ps(mask.0)) | intrinsic!(_mm256_movemask_ps(mask.1)) << 8) as u16
     }
     #[inline(always)]
     fn any(mask: Self::Mask) -> bool {
