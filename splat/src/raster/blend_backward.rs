@@ -52,6 +52,8 @@ fn backward_kernel<S: Simd>(
         let first = band.rounds[round];
         if round + 1 < rounds {
             band.lists.fill::<S>(view, first);
+        } else {
+            band.lists.prefetch();
         }
         for tile in 0..view.tiles() {
             band.tile.gather(&band.lists, tile, view.centre(tile));

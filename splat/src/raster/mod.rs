@@ -24,6 +24,7 @@ mod project;
 mod project_backward;
 mod rows;
 mod session;
+mod spans;
 #[cfg(test)]
 mod tests;
 mod tile;

@@ -388,8 +388,9 @@ fn rounds_of_any_size_give_the_same_bytes() {
         gaussians
     };
     let small = [(1 << 16, 40), (100, 1 << 18), (64, 300), (1, 1 << 18)];
-    for (gaussians, instructions) in
-        [-5.0, 1.0].into_iter().flat_map(|logit| Instructions::available().map(move |set| (scene(logit), set)))
+    for (gaussians, instructions) in [-5.0, 1.0]
+        .into_iter()
+        .flat_map(|logit| Instructions::available().map(move |set| (scene(logit), set)))
     {
         let whole = in_rounds(&gaussians, RoundLimit::default(), instructions);
         for (footprints, places) in small {

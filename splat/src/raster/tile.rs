@@ -75,10 +75,7 @@ impl<S: Simd> Offsets<S> {
     #[inline(always)]
     pub(super) fn new(block: usize) -> Self {
         let [x, y] = first_offset(block);
-        Self {
-            x: S::load(&COLUMNS).add(S::splat(x)),
-            y: S::load(&LANE_ROWS).add(S::splat(y)),
-        }
+        Self { x: S::load(&COLUMNS).add(S::splat(x)), y: S::load(&LANE_ROWS).add(S::splat(y)) }
     }
 }
 
