@@ -13,7 +13,16 @@ mod document;
 mod reference;
 mod row;
 
+mod adam;
+mod harmonics;
+mod loss;
 mod metrics;
+mod raster_backward;
+mod raster_forward;
+mod raster_input;
+mod scenes;
+mod session;
+mod storage;
 
 /// A test for every sweep, and the list of them.
 macro_rules! sweeps {
@@ -31,4 +40,4 @@ macro_rules! sweeps {
 }
 
 // In the order of a training step.
-sweeps! { metrics }
+sweeps! { raster_forward, raster_backward, raster_input, loss, adam, session, harmonics, storage, metrics }
