@@ -1,9 +1,10 @@
-//! Developer commands: `cargo xtask test`, `cargo xtask lint`, `cargo xtask bench`.
+//! Developer commands: `cargo xtask test`, `cargo xtask lint`, `cargo xtask bench`, `cargo xtask numerics`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
 
 mod bench;
 mod cargo;
 mod instructions;
+mod numerics;
 mod prerequisites;
 
 use clap::{Parser, Subcommand};
@@ -24,6 +25,8 @@ enum Command {
     /// Speed of the CPU engine: tables, and instruction counts that noise cannot change.
     #[command(subcommand)]
     Bench(bench::Bench),
+    /// Every stage at its extremes: runs the suite and renews the tables of docs/numerics.md.
+    Numerics,
 }
 
 fn main() -> anyhow::Result<()> {
@@ -35,6 +38,7 @@ fn main() -> anyhow::Result<()> {
         }
         Command::Lint => lint(),
         Command::Bench(bench) => bench.run(),
+        Command::Numerics => numerics::run(),
     }
 }
 
