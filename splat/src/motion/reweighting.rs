@@ -52,8 +52,7 @@ impl Reweighting {
         let independent = displacements.independent_pixels(self.noise_correlation_area);
         let limit = TRIGGER * (1.0 + TRIGGER_DEVIATIONS / independent.sqrt());
         let is_explained = displacements.affine_residual_power() <= limit * noise;
-        let scale_squared =
-            (SCALE_SQUARED * displacements.power).max(LEAST_SIGNIFICANCE.powi(2) * noise);
+        let scale_squared = (SCALE_SQUARED * displacements.power).max(LEAST_SIGNIFICANCE.powi(2) * noise);
         let is_usable = scale_squared.is_normal() && scale_squared.recip().is_finite();
         (!is_explained && is_usable).then(|| ExpectedMotion {
             centre: moments.centroid,

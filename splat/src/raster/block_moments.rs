@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     motion::reweighting::ExpectedMotion,
-    simd::{Group, LANES, Simd, prefetch, simd_kernel},
+    simd::{Group, LANES, ROWS, Simd, prefetch, simd_kernel},
     tracking::TrackField,
 };
 
@@ -23,74 +23,80 @@ const SIGMA: [f32; 2] = [1e-6, 1e6];
 /// Displacement, px, beyond which a track is no track.
 const FARTHEST: f64 = 65_536.0;
 
-/// Sums of one footprint in image coordinates, pixels, `a, b` being the displacement of a pixel `u, v`.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Sums {
-    /// `Σ w` of the blending weights `w = alpha · T` over all pixels.
-    pub blend_weight: f64,
-    /// `Σ w` over the pixels with a usable track.
-    pub visible: f64,
-    /// `Σ ω` with `ω = w / σ²`, over these pixels as all that follows.
-    pub weight: f64,
-    pub weight_squared: f64,
-    pub pixels: f64,
-    /// `Σ ω (u, v)`.
-    pub position: [f64; 2],
-    /// `Σ ω (a, b)`.
-    pub displacement: [f64; 2],
-    /// `Σ ω (uu, uv, vv)`.
-    pub source: [f64; 3],
-    /// `Σ ω (au, av, bu, bv)`.
-    pub cross: [f64; 4],
-    /// `Σ ω (aa + bb)`.
-    pub power: f64,
+/// A pixel's features, in the order of the columns of [`BlockTracks::features`] and of [`Sums`]: with `r` the inverse
+/// variance of its track, `u, v` its position and `a, b` its displacement.
+pub(super) mod feature {
+    /// `r`; then `ru`, `rv`, `ra`, `rb`.
+    pub(crate) const WEIGHT: usize = 0;
+    /// First of `ru`, `rv`.
+    pub(crate) const POSITION: usize = 1;
+    /// First of `ruu`, `ruv`, `rvv`.
+    pub(crate) const SOURCE: usize = 5;
+    /// First of `rau`, `rav`, `rbu`, `rbv`.
+    pub(crate) const CROSS: usize = 8;
+    /// First of `raa`, `rbb`.
+    pub(crate) const POWER: usize = 12;
+    /// One where the track can be used.
+    pub(crate) const VISIBLE: usize = 14;
+    /// One.
+    pub(crate) const BLEND_WEIGHT: usize = 15;
 }
 
-impl Sums {
-    pub(super) fn add(&mut self, other: &Self) {
-        self.blend_weight += other.blend_weight;
-        self.visible += other.visible;
-        self.weight += other.weight;
-        self.weight_squared += other.weight_squared;
-        self.pixels += other.pixels;
-        self.power += other.power;
-        add(&mut self.position, other.position);
-        add(&mut self.displacement, other.displacement);
-        add(&mut self.source, other.source);
-        add(&mut self.cross, other.cross);
-    }
+/// Sums of one footprint over its pixels, in image coordinates: blending weight `alpha · T` times each [`feature`], and
+/// two more. Plain numbers, so that a list of zeros costs nothing until it is touched.
+pub(super) type Sums = [f64; SUMS];
+const SUMS: usize = LANES + 2;
+/// `(alpha · T · r)²`.
+pub(super) const WEIGHT_SQUARED: usize = LANES;
+/// Pixels with a usable track.
+pub(super) const PIXELS: usize = LANES + 1;
 
-    /// Adds a block's sums `m`, see [`BlockTracks::features`], by the parallel-axis theorem.
-    #[inline(always)]
-    fn add_block(&mut self, sums: &[f32; LANES], tracks: &BlockTracks) {
-        let mut m = [0.0; LANES];
-        for (wide, &sum) in m.iter_mut().zip(sums) {
-            *wide = f64::from(sum);
+/// Adds a block's sums, which are relative to its centre and reference, by the parallel-axis theorem.
+#[inline(always)]
+fn add_block(sums: &mut Sums, relative: &[f32; LANES], shift: &Shift) {
+    let (mut m, mut linear) = ([0.0; LANES], [0.0; LANES]);
+    for k in 0..LANES {
+        m[k] = f64::from(relative[k]);
+        linear[k] = m[k];
+    }
+    for k in 0..FACTORS {
+        linear[k] += shift.of_weight[k] * m[0];
+    }
+    for k in 0..LANES {
+        let of_products = shift.relative[k] * m[SECOND[k]] + shift.shifted[k] * linear[FIRST[k]];
+        sums[k] += linear[k] + of_products;
+    }
+}
+
+/// The features of at most one factor, rounded up to half a group.
+const FACTORS: usize = LANES / 2;
+/// Of each feature that is a product of two, the first; any other feature for those that are not.
+const FIRST: [usize; LANES] = [0, 0, 0, 0, 0, 1, 1, 2, 1, 2, 1, 2, 3, 4, 0, 0];
+/// The second.
+const SECOND: [usize; LANES] = [0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4, 4, 3, 4, 0, 0];
+
+/// Factors of the parallel-axis theorem: with `p, q` relative to `P, Q`, a sum of `(p + P)(q + Q)` is that of `pq`, plus
+/// `P` times that of `q`, plus `Q` times that of `p + P`.
+#[derive(Clone, Debug, Default)]
+struct Shift {
+    /// Per feature of one factor: its shift.
+    of_weight: [f64; FACTORS],
+    /// Per product: the shift of its first factor.
+    relative: [f64; LANES],
+    /// Per product: the shift of its second factor.
+    shifted: [f64; LANES],
+}
+
+impl Shift {
+    fn new(centre: [f64; 2], reference: [f64; 2]) -> Self {
+        let by = [0.0, centre[0], centre[1], reference[0], reference[1]];
+        let mut shift = Self::default();
+        shift.of_weight[..by.len()].copy_from_slice(&by);
+        for k in 0..LANES {
+            shift.relative[k] = by[FIRST[k]];
+            shift.shifted[k] = by[SECOND[k]];
         }
-        let ([u, v], [a, b]) = (tracks.centre, tracks.reference);
-        let (su, sv) = (m[1] + u * m[0], m[2] + v * m[0]);
-        let (sa, sb) = (m[3] + a * m[0], m[4] + b * m[0]);
-        self.weight += m[0];
-        self.position[0] += su;
-        self.position[1] += sv;
-        self.displacement[0] += sa;
-        self.displacement[1] += sb;
-        self.source[0] += m[5] + u * (m[1] + su);
-        self.source[1] += m[6] + u * m[2] + v * su;
-        self.source[2] += m[7] + v * (m[2] + sv);
-        self.cross[0] += m[8] + u * m[3] + a * su;
-        self.cross[1] += m[9] + v * m[3] + a * sv;
-        self.cross[2] += m[10] + u * m[4] + b * su;
-        self.cross[3] += m[11] + v * m[4] + b * sv;
-        self.power += m[12] + a * (m[3] + sa) + b * (m[4] + sb);
-        self.visible += m[13];
-        self.blend_weight += m[14];
-    }
-}
-
-fn add<const N: usize>(sums: &mut [f64; N], values: [f64; N]) {
-    for (sum, value) in sums.iter_mut().zip(values) {
-        *sum += value;
+        shift
     }
 }
 
@@ -105,10 +111,9 @@ struct BlockTracks {
     precision: [f32; LANES],
     /// Displacement per axis and pixel, relative to the reference; zero where the track cannot be used.
     displacement: [[f32; LANES]; 2],
-    /// Per pixel: what its weight is multiplied with in each sum. With `r` the precision, `u, v` the pixel from the
-    /// block's centre and `a, b` the displacement from the reference:
-    /// `r, ru, rv, ra, rb, ruu, ruv, rvv, rau, rav, rbu, rbv, r(aa + bb), rσ², 1` and nothing.
+    /// Per pixel its features, positions relative to the block's centre and displacements to the reference.
     features: [[f32; LANES]; LANES],
+    shift: Shift,
 }
 
 /// Offsets of a block's pixels from its centre.
@@ -118,49 +123,42 @@ fn offset(lane: usize) -> [f32; 2] {
 }
 
 impl BlockTracks {
-    fn new(band: &Band, block: usize, tracks: &TrackField) -> Self {
+    /// Takes the tracks of another block.
+    fn reset(&mut self, band: &Band, block: usize, tracks: &TrackField) {
         let (column, row) = corner(block);
         let half = BLOCK as f64 / 2.0;
-        let mut of_block = Self {
-            centre: [column as f64 + half, (band.first_row + row) as f64 + half],
-            ..Self::default()
-        };
+        self.centre = [column as f64 + half, (band.first_row + row) as f64 + half];
+        self.precision = [0.0; LANES];
+        self.displacement = [[0.0; LANES]; 2];
+        self.features = [[0.0; LANES]; LANES];
         let first = band.first_row * band.width;
         let mut usable = [(0, [0.0; 2]); LANES];
         let mut count = 0;
         for (lane, place) in band.pixels(block) {
-            of_block.features[lane][14] = 1.0;
+            self.features[lane][feature::BLEND_WEIGHT] = 1.0;
             let pixel = first + place;
             let [x, y] = tracks.positions[pixel].map(f64::from);
             let [u, v] = offset(lane).map(f64::from);
-            let displacement = [x - (of_block.centre[0] + u), y - (of_block.centre[1] + v)];
+            let displacement = [x - (self.centre[0] + u), y - (self.centre[1] + v)];
             let sigma = tracks.sigma[pixel];
-            let is_near = displacement[0].abs().max(displacement[1].abs()) <= FARTHEST;
+            let is_near = displacement[0].abs() <= FARTHEST && displacement[1].abs() <= FARTHEST;
             // Comparisons with NaN are false.
-            if tracks.visible[pixel] && sigma > 0.0 && sigma < f32::INFINITY && is_near && x + y == x + y {
-                of_block.precision[lane] = sigma.clamp(SIGMA[0], SIGMA[1]).powi(2).recip();
+            if tracks.visible[pixel] && sigma > 0.0 && sigma < f32::INFINITY && is_near {
+                self.precision[lane] = sigma.clamp(SIGMA[0], SIGMA[1]).powi(2).recip();
                 usable[count] = (lane, displacement);
                 count += 1;
             }
         }
-        of_block.set(&usable[..count]);
-        of_block
+        self.set(&usable[..count]);
     }
 
     fn set(&mut self, usable: &[(usize, [f64; 2])]) {
         if usable.is_empty() {
             return;
         }
-        // The median, so that most of a block that straddles two motions is close to the reference.
-        for axis in 0..2 {
-            let mut values = [0.0; LANES];
-            let values = &mut values[..usable.len()];
-            for (value, (_, displacement)) in values.iter_mut().zip(usable) {
-                *value = displacement[axis];
-            }
-            let (_, median, _) = values.select_nth_unstable_by(usable.len() / 2, f64::total_cmp);
-            self.reference[axis] = *median;
-        }
+        // One that occurs, so that most of a block that straddles two motions, or half of it, is close to it.
+        self.reference = usable[usable.len() / 2].1;
+        self.shift = Shift::new(self.centre, self.reference);
         for &(lane, displacement) in usable {
             let [u, v] = offset(lane);
             let (a, b) =
@@ -182,10 +180,10 @@ impl BlockTracks {
                 ra * v,
                 rb * u,
                 rb * v,
-                ra * a + rb * b,
+                ra * a,
+                rb * b,
                 1.0,
                 1.0,
-                0.0,
             ];
         }
     }
@@ -230,13 +228,17 @@ impl LocalMotion {
     }
 }
 
+/// The slot of an entry that has none.
+pub(super) const NONE: u32 = u32::MAX;
+
 simd_kernel! {
-    /// Adds the band's shares to the sums of its entries. `expected` is empty, or per entry the motion by which its pixels
-    /// are reweighted; entries without one are left out.
+    /// Adds the band's shares to `sums`, one for each of its entries; or, if `expected` has any, one for each expectation,
+    /// by which the pixels of its entry are reweighted. `slots` says which belongs to an entry, [`NONE`] that none does.
     pub(super) fn add_moments(
         band: &Band,
         tracks: &TrackField,
-        expected: &[Option<ExpectedMotion>],
+        slots: &[u32],
+        expected: &[ExpectedMotion],
         sums: &mut [Sums],
     ) = moments_kernel
 }
@@ -245,19 +247,21 @@ simd_kernel! {
 fn moments_kernel<S: Simd>(
     band: &Band,
     tracks: &TrackField,
-    expected: &[Option<ExpectedMotion>],
+    slots: &[u32],
+    expected: &[ExpectedMotion],
     sums: &mut [Sums],
 ) {
+    let mut of_block = BlockTracks::default();
     for block in 0..band.lists.blocks() {
         let list = band.lists.of(block);
         let end = if expected.is_empty() {
             list.len()
         } else {
-            list.iter().rposition(|&entry| expected[entry as usize].is_some()).map_or(0, |last| last + 1)
+            list.iter().rposition(|&entry| slots[entry as usize] != NONE).map_or(0, |last| last + 1)
         };
         if end > 0 {
-            let tracks = BlockTracks::new(band, block, tracks);
-            block_moments::<S>(band, block, &list[..end], &tracks, expected, sums);
+            of_block.reset(band, block, tracks);
+            block_moments::<S>(band, block, &list[..end], &of_block, slots, expected, sums);
         }
     }
 }
@@ -268,15 +272,14 @@ fn block_moments<S: Simd>(
     block: usize,
     list: &[u32],
     tracks: &BlockTracks,
-    expected: &[Option<ExpectedMotion>],
+    slots: &[u32],
+    expected: &[ExpectedMotion],
     sums: &mut [Sums],
 ) {
     let entries: &[Entry] = &band.lists.entries;
     let (column, row) = corner(block);
     let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
-    let (zero, one) = (S::splat(0.0), S::splat(1.0));
-    let least = S::splat(TRANSMITTANCE_MIN);
-    let precision = S::load(&tracks.precision);
+    let (zero, least) = (S::splat(0.0), S::splat(TRANSMITTANCE_MIN));
     let middle = S::splat((BLOCK as f32 - 1.0) / 2.0);
     let mut rows = [0.0; LANES];
     for (lane, row) in rows.iter_mut().enumerate() {
@@ -289,21 +292,24 @@ fn block_moments<S: Simd>(
     }
     let mut inside = [0.0; LANES];
     for (inside, values) in inside.iter_mut().zip(&tracks.features) {
-        *inside = values[14];
+        *inside = values[feature::BLEND_WEIGHT];
     }
     let mut running = S::load(&inside);
     let mut alphas = [zero; BATCH];
-    let mut weights = Group::default();
+    let mut live = Live::default();
     for (number, batch) in list.chunks(BATCH).enumerate() {
         for &later in list.iter().skip((number + 1) * BATCH).take(BATCH) {
             prefetch(&entries[later as usize]);
-            prefetch(&sums[later as usize]);
+            if expected.is_empty() {
+                prefetch(&sums[later as usize]);
+            }
         }
         for (alpha, &entry) in alphas.iter_mut().zip(batch) {
             let entry = &entries[entry as usize];
             let value = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
             *alpha = S::select(value.ge(S::splat(ALPHA_MIN)), value, zero);
         }
+        live.count = 0;
         for (&alpha, &entry) in alphas.iter().zip(batch) {
             // As in `blend`: falls on where blending has stopped.
             let weight = running.mul(alpha);
@@ -312,28 +318,66 @@ fn block_moments<S: Simd>(
             if !S::any(zero.lt(weight)) {
                 continue;
             }
-            if let Some(motion) = expected.get(entry as usize) {
-                let Some(motion) = motion else { continue };
+            let mut slot = entry;
+            if !expected.is_empty() {
+                slot = slots[entry as usize];
+                let Some(motion) = expected.get(slot as usize) else { continue };
                 weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks, offsets));
             }
-            weight.store(&mut weights.0);
-            let mut parts = [zero; 4];
-            for lane in 0..LANES {
-                parts[lane % 4] = S::splat(weights.0[lane]).mul_add(features[lane], parts[lane % 4]);
-            }
-            let mut values = [0.0; LANES];
-            parts[0].add(parts[1]).add(parts[2].add(parts[3])).store(&mut values);
-            let reliable = weight.mul(precision);
-            let counted = S::select(zero.lt(reliable), one, zero);
-            let mut by_row = [0.0; LANES];
-            S::row_sums([reliable.mul(reliable), counted, zero, zero]).store(&mut by_row);
-            let sums = &mut sums[entry as usize];
-            sums.add_block(&values, tracks);
-            sums.weight_squared += f64::from((by_row[0] + by_row[4]) + (by_row[8] + by_row[12]));
-            sums.pixels += f64::from((by_row[1] + by_row[5]) + (by_row[9] + by_row[13]));
+            weight.store(&mut live.weights[live.count].0);
+            live.slots[live.count] = slot;
+            live.count += 1;
         }
+        live.add::<S>(tracks, &features, sums);
         if !S::any(running.ge(least)) {
             break;
         }
     }
+}
+
+/// The slots of a batch's entries that a block's pixels see, and their weights: kept in memory, from where a weight reaches all
+/// lanes in one instruction.
+#[derive(Default)]
+struct Live {
+    count: usize,
+    slots: [u32; BATCH],
+    weights: [Group; BATCH],
+}
+
+impl Live {
+    #[inline(always)]
+    fn add<S: Simd>(&self, tracks: &BlockTracks, features: &[S; LANES], sums: &mut [Sums]) {
+        let (zero, one) = (S::splat(0.0), S::splat(1.0));
+        let precision = S::load(&tracks.precision);
+        for first in (0..self.count).step_by(ROWS) {
+            // What lies beyond the count is of earlier batches, and not used.
+            let (mut squares, mut counts) = ([zero; ROWS], [zero; ROWS]);
+            for slot in 0..ROWS {
+                let reliable = S::load(&self.weights[first + slot].0).mul(precision);
+                squares[slot] = reliable.mul(reliable);
+                counts[slot] = S::select(zero.lt(reliable), one, zero);
+            }
+            let (mut by_row, mut counted) = ([0.0; LANES], [0.0; LANES]);
+            S::row_sums(squares).store(&mut by_row);
+            S::row_sums(counts).store(&mut counted);
+            for slot in 0..ROWS.min(self.count - first) {
+                let weights = &self.weights[first + slot].0;
+                let mut parts = [zero; 4];
+                for lane in 0..LANES {
+                    parts[lane % 4] = S::splat(weights[lane]).mul_add(features[lane], parts[lane % 4]);
+                }
+                let mut values = [0.0; LANES];
+                parts[0].add(parts[1]).add(parts[2].add(parts[3])).store(&mut values);
+                let sums = &mut sums[self.slots[first + slot] as usize];
+                add_block(sums, &values, &tracks.shift);
+                sums[WEIGHT_SQUARED] += f64::from(column_sum(&by_row, slot));
+                sums[PIXELS] += f64::from(column_sum(&counted, slot));
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn column_sum(rows: &[f32; LANES], column: usize) -> f32 {
+    (rows[column] + rows[ROWS + column]) + (rows[2 * ROWS + column] + rows[3 * ROWS + column])
 }

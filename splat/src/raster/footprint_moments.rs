@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::{
     bin::Bins,
     blend::Band,
-    block_moments::{Sums, add_moments},
+    block_moments::{NONE, PIXELS, Sums, WEIGHT_SQUARED, add_moments, feature},
     project::project,
 };
 use crate::{
@@ -20,9 +20,12 @@ use crate::{
         moments::FootprintMoments,
         reweighting::{ExpectedMotion, Reweighting},
     },
-    simd::Instructions,
+    simd::{Instructions, prefetch},
     tracking::TrackField,
 };
+
+/// Gaussians whose sums are asked for ahead.
+const AHEAD: usize = 8;
 
 /// Moments of every Gaussian's footprint, one entry per Gaussian; all zero for those that no pixel sees.
 pub(super) fn footprint_moments(
@@ -38,21 +41,25 @@ pub(super) fn footprint_moments(
     bins.sort(camera.height, &mut Vec::new());
     let mut view = View { instructions, bins: &bins, tracks, bands: Vec::new() };
     view.list(camera);
+    let of_bands = view.sums();
+    let count = gaussians.len();
     let mut moments: Vec<FootprintMoments> =
-        view.sums(gaussians.len(), &[]).par_iter().map(Sums::centred).collect();
+        (0..count).into_par_iter().map(|index| centred(&view.total(&of_bands, index))).collect();
+    drop(of_bands);
     let Some(reweighting) = reweighting else { return Ok(moments) };
+    let expect = |index: u32| Some((index, reweighting.expected(&moments[index as usize])?));
+    let mut expected: Vec<(u32, ExpectedMotion)> =
+        (0..count as u32).into_par_iter().filter_map(expect).collect();
     for _ in 0..reweighting.passes {
-        let expected: Vec<Option<ExpectedMotion>> =
-            moments.par_iter().map(|moments| reweighting.expected(moments)).collect();
-        if expected.iter().all(Option::is_none) {
+        if expected.is_empty() {
             break;
         }
-        let sums = view.sums(gaussians.len(), &expected);
-        moments.par_iter_mut().zip(&sums).zip(&expected).for_each(|((moments, sums), expected)| {
-            if expected.is_some() {
-                moments.reweigh(sums.centred());
-            }
-        });
+        for (index, sums) in view.reweighted_sums(count, &expected) {
+            moments[index].reweigh(centred(&sums));
+        }
+        // What stands once, stands.
+        let expect = |index: u32| Some((index, reweighting.expected(&moments[index as usize])?));
+        expected = expected.into_par_iter().filter_map(|(index, _)| expect(index)).collect();
     }
     Ok(moments)
 }
@@ -91,76 +98,100 @@ impl View<'_> {
             .for_each(|(number, band)| band.reset(instructions, bins, number, width, height, &[]));
     }
 
-    /// One pass: the sums of every footprint, of those with an expected motion only if any is given.
-    fn sums(&self, count: usize, expected: &[Option<ExpectedMotion>]) -> Vec<Sums> {
-        let by_band: Vec<Vec<Sums>> = self
-            .bands
-            .par_iter()
-            .enumerate()
-            .map(|(number, band)| {
-                let indices = self.bins.band(number);
-                let of_entries: Vec<Option<ExpectedMotion>> = match expected.is_empty() {
-                    true => Vec::new(),
-                    false => indices.iter().map(|&index| expected[index as usize]).collect(),
-                };
-                let mut sums = vec![Sums::default(); indices.len()];
-                add_moments(self.instructions, band, self.tracks, &of_entries, &mut sums);
-                sums
-            })
-            .collect();
-        (0..count)
-            .into_par_iter()
-            .map(|index| {
-                let (first_band, places) = self.bins.places_of(index);
-                let mut total = Sums::default();
-                for (band, &place) in by_band[first_band..].iter().zip(places) {
-                    total.add(&band[place as usize]);
+    /// The sums of each band's footprints.
+    fn sums(&self) -> Vec<Vec<Sums>> {
+        let of_band = |(number, band): (usize, &Band)| {
+            let mut sums = vec![ZERO; self.bins.band(number).len()];
+            add_moments(self.instructions, band, self.tracks, &[], &[], &mut sums);
+            sums
+        };
+        self.bands.par_iter().enumerate().map(of_band).collect()
+    }
+
+    /// The sums of the Gaussians, of `count`, whose pixels are reweighted by an expected motion; in their order.
+    fn reweighted_sums(&self, count: usize, expected: &[(u32, ExpectedMotion)]) -> Vec<(usize, Sums)> {
+        let mut expectation_of = vec![NONE; count];
+        for (number, (index, _)) in expected.iter().enumerate() {
+            expectation_of[*index as usize] = number as u32;
+        }
+        let of_band = |(number, band): (usize, &Band)| {
+            let (mut slots, mut numbers, mut motions) = (Vec::new(), Vec::new(), Vec::new());
+            for &index in self.bins.band(number) {
+                let number = expectation_of[index as usize];
+                slots.push(if number == NONE { NONE } else { numbers.len() as u32 });
+                if number != NONE {
+                    numbers.push(number as usize);
+                    motions.push(expected[number as usize].1);
                 }
-                total
-            })
-            .collect()
+            }
+            let mut sums = vec![ZERO; motions.len()];
+            if !motions.is_empty() {
+                add_moments(self.instructions, band, self.tracks, &slots, &motions, &mut sums);
+            }
+            (numbers, sums)
+        };
+        let of_bands: Vec<(Vec<usize>, Vec<Sums>)> = self.bands.par_iter().enumerate().map(of_band).collect();
+        let mut totals: Vec<(usize, Sums)> =
+            expected.iter().map(|(index, _)| (*index as usize, ZERO)).collect();
+        for (numbers, sums) in &of_bands {
+            for (&number, sums) in numbers.iter().zip(sums) {
+                add(&mut totals[number].1, sums);
+            }
+        }
+        totals
+    }
+
+    /// The sums of one footprint over all bands.
+    fn total(&self, of_bands: &[Vec<Sums>], index: usize) -> Sums {
+        // Depth order is no order in memory.
+        if index + AHEAD < self.bins.projection.bands.len() {
+            let (first_band, places) = self.bins.places_of(index + AHEAD);
+            for (band, &place) in of_bands[first_band..].iter().zip(places) {
+                prefetch(&band[place as usize]);
+            }
+        }
+        let (first_band, places) = self.bins.places_of(index);
+        let mut total = ZERO;
+        for (band, &place) in of_bands[first_band..].iter().zip(places) {
+            add(&mut total, &band[place as usize]);
+        }
+        total
     }
 }
 
-impl Sums {
-    /// Central moments, by the parallel-axis theorem. Double precision holds image coordinates to 1e-12 px, so what
-    /// cancels is far below a footprint's spread.
-    fn centred(&self) -> FootprintMoments {
-        let mut moments = FootprintMoments { blend_weight: self.blend_weight, ..Default::default() };
-        if !(self.weight > 0.0) {
-            return moments;
-        }
-        let w = self.weight;
-        let [u, v] = self.position.map(|sum| sum / w);
-        let [a, b] = self.displacement.map(|sum| sum / w);
-        let source = [
-            (self.source[0] - w * u * u).max(0.0),
-            self.source[1] - w * u * v,
-            (self.source[2] - w * v * v).max(0.0),
-        ];
-        let strain = [
-            self.cross[0] - w * a * u,
-            self.cross[1] - w * a * v,
-            self.cross[2] - w * b * u,
-            self.cross[3] - w * b * v,
-        ];
-        let power = (self.power - w * (a * a + b * b)).max(0.0);
-        moments.weight = w;
-        moments.weight_squared = self.weight_squared;
-        moments.pixels = self.pixels as u32;
-        moments.centroid = [u, v];
-        moments.tracked_centroid = [u + a, v + b];
-        moments.source = source;
-        // The tracked position is the pixel plus its displacement.
-        moments.cross = [
-            source[0] + strain[0],
-            source[1] + strain[1],
-            source[1] + strain[2],
-            source[2] + strain[3],
-        ];
-        moments.target = source[0] + source[2] + 2.0 * (strain[0] + strain[3]) + power;
-        moments.variance = self.visible;
-        moments.visible = self.visible;
-        moments
+const ZERO: Sums = [0.0; size_of::<Sums>() / size_of::<f64>()];
+
+fn add(sums: &mut Sums, values: &Sums) {
+    for (sum, value) in sums.iter_mut().zip(values) {
+        *sum += value;
     }
+}
+
+/// Central moments, by the parallel-axis theorem. Double precision holds image coordinates to 1e-12 px, so what
+/// cancels is far below a footprint's spread.
+fn centred(of: &Sums) -> FootprintMoments {
+    let mut moments = FootprintMoments { blend_weight: of[feature::BLEND_WEIGHT], ..Default::default() };
+    let w = of[feature::WEIGHT];
+    if !(w > 0.0) {
+        return moments;
+    }
+    let [u, v, a, b] = [0, 1, 2, 3].map(|k| of[feature::POSITION + k] / w);
+    let [uu, uv, vv] = [0, 1, 2].map(|k| of[feature::SOURCE + k]);
+    let [au, av, bu, bv] = [0, 1, 2, 3].map(|k| of[feature::CROSS + k]);
+    let source = [(uu - w * u * u).max(0.0), uv - w * u * v, (vv - w * v * v).max(0.0)];
+    let strain = [au - w * a * u, av - w * a * v, bu - w * b * u, bv - w * b * v];
+    let power = of[feature::POWER] + of[feature::POWER + 1] - w * (a * a + b * b);
+    moments.weight = w;
+    moments.weight_squared = of[WEIGHT_SQUARED];
+    moments.pixels = of[PIXELS] as u32;
+    moments.centroid = [u, v];
+    moments.tracked_centroid = [u + a, v + b];
+    moments.source = source;
+    // The tracked position is the pixel plus its displacement.
+    moments.cross =
+        [source[0] + strain[0], source[1] + strain[1], source[1] + strain[2], source[2] + strain[3]];
+    moments.target = source[0] + source[2] + 2.0 * (strain[0] + strain[3]) + power.max(0.0);
+    moments.variance = of[feature::VISIBLE];
+    moments.visible = of[feature::VISIBLE];
+    moments
 }
