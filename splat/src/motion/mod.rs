@@ -23,6 +23,7 @@ mod neighbours;
 mod observe;
 mod propagate;
 mod regularize;
+pub mod reweighting;
 mod rotation;
 mod settings;
 mod static_test;

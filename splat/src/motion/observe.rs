@@ -40,7 +40,7 @@ pub(super) fn observe(
                 tracks.width, tracks.height, camera.width, camera.height
             )));
         }
-        let moments = engine.footprint_moments(gaussians, camera, tracks)?;
+        let moments = engine.footprint_moments(gaussians, camera, tracks, None)?;
         if moments.len() != gaussians.len() {
             return Err(EngineError::InvalidInput(format!(
                 "engine {} gave {} footprints for {} Gaussians",

@@ -4,6 +4,7 @@
 mod clip;
 mod dense;
 mod extremes;
+mod moments;
 mod parts;
 mod scenes;
 
