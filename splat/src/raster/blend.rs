@@ -61,7 +61,7 @@ impl<S: Simd> Open<S> {
     }
 
     #[inline(always)]
-    fn store(self, to: &mut [f32; LANES]) {
+    pub(super) fn store(self, to: &mut [f32; LANES]) {
         let stopped = S::splat(0.0).sub(self.transmittance);
         S::select(self.running.ge(S::splat(TRANSMITTANCE_MIN)), self.transmittance, stopped).store(to);
     }

@@ -7,9 +7,9 @@
 //! in double precision.
 
 use super::{
-    ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
-    blend::{BATCH, Band, COLUMNS, Local},
-    blocks::{BLOCK, Entry, corner},
+    blend::{BATCH, Open},
+    blocks::{BLOCK, BLOCKS, BandView, Listed, TILE, TileLists, corner},
+    tile::{Offsets, Tile, first_offset},
 };
 use crate::{
     motion::reweighting::ExpectedMotion,
@@ -124,17 +124,17 @@ fn offset(lane: usize) -> [f32; 2] {
 
 impl BlockTracks {
     /// Takes the tracks of another block.
-    fn reset(&mut self, band: &Band, block: usize, tracks: &TrackField) {
+    fn reset(&mut self, band: &BandView<'_>, tile: usize, block: usize, tracks: &TrackField) {
         let (column, row) = corner(block);
         let half = BLOCK as f64 / 2.0;
-        self.centre = [column as f64 + half, (band.first_row + row) as f64 + half];
+        self.centre = [(tile * TILE + column) as f64 + half, (band.first_row() + row) as f64 + half];
         self.precision = [0.0; LANES];
         self.displacement = [[0.0; LANES]; 2];
         self.features = [[0.0; LANES]; LANES];
-        let first = band.first_row * band.width;
+        let first = band.first_row() * band.width;
         let mut usable = [(0, [0.0; 2]); LANES];
         let mut count = 0;
-        for (lane, place) in band.pixels(block) {
+        for (lane, place) in band.pixels(tile, block) {
             self.features[lane][feature::BLEND_WEIGHT] = 1.0;
             let pixel = first + place;
             let [x, y] = tracks.positions[pixel].map(f64::from);
@@ -215,7 +215,10 @@ impl LocalMotion {
 
     /// The share of each pixel's weight that its residual leaves.
     #[inline(always)]
-    fn share<S: Simd>(&self, tracks: &BlockTracks, [u, v]: [S; 2]) -> S {
+    fn share<S: Simd>(&self, tracks: &BlockTracks, block: usize, at: &Offsets<S>) -> S {
+        let middle = (BLOCK as f32 - 1.0) / 2.0;
+        let [first_x, first_y] = first_offset(block);
+        let (u, v) = (at.x.sub(S::splat(first_x + middle)), at.y.sub(S::splat(first_y + middle)));
         let mut squared = S::splat(0.0);
         for axis in 0..2 {
             let [by_u, by_v] = self.gradient[axis];
@@ -224,114 +227,126 @@ impl LocalMotion {
             let residual = S::load(&tracks.displacement[axis]).sub(expected);
             squared = residual.mul_add(residual, squared);
         }
-        squared.mul(S::splat(-self.fall)).exp2()
+        // Below, the power may be anything.
+        squared.mul(S::splat(-self.fall)).max(S::splat(-126.0)).exp2()
     }
 }
 
 /// The slot of an entry that has none.
 pub(super) const NONE: u32 = u32::MAX;
 
+/// What a band's sums are made with, kept from band to band.
+#[derive(Default)]
+pub(super) struct Scratch {
+    lists: TileLists,
+    tile: Tile,
+    /// Per block of the band, what its pixels let through, see [`Open`].
+    open: Vec<[f32; LANES]>,
+    of_block: BlockTracks,
+    live: Live,
+}
+
+/// Which sums a footprint adds to.
+#[derive(Clone, Copy)]
+pub(super) struct Slots<'a> {
+    /// Per footprint of the band its number among the expected motions, or [`NONE`]; not used if none is expected.
+    pub of_footprint: &'a [u32],
+    /// By which the footprints' pixels are reweighted. None: every footprint has sums, unweighted.
+    pub expected: &'a [ExpectedMotion],
+}
+
+impl Slots<'_> {
+    #[inline(always)]
+    fn of(&self, footprint: usize) -> u32 {
+        if self.expected.is_empty() { footprint as u32 } else { self.of_footprint[footprint] }
+    }
+}
+
 simd_kernel! {
-    /// Adds the band's shares to `sums`, one for each of its entries; or, if `expected` has any, one for each expectation,
-    /// by which the pixels of its entry are reweighted. `slots` says which belongs to an entry, [`NONE`] that none does.
+    /// Adds the band's shares to `sums`: one for each of its footprints or, if motions are expected, one for each of those.
     pub(super) fn add_moments(
-        band: &Band,
+        scratch: &mut Scratch,
+        band: &BandView<'_>,
         tracks: &TrackField,
-        slots: &[u32],
-        expected: &[ExpectedMotion],
+        slots: Slots<'_>,
         sums: &mut [Sums],
     ) = moments_kernel
 }
 
 #[inline(always)]
 fn moments_kernel<S: Simd>(
-    band: &Band,
+    scratch: &mut Scratch,
+    band: &BandView<'_>,
     tracks: &TrackField,
-    slots: &[u32],
-    expected: &[ExpectedMotion],
+    slots: Slots<'_>,
     sums: &mut [Sums],
 ) {
-    let mut of_block = BlockTracks::default();
-    for block in 0..band.lists.blocks() {
-        let list = band.lists.of(block);
-        let end = if expected.is_empty() {
-            list.len()
-        } else {
-            list.iter().rposition(|&entry| slots[entry as usize] != NONE).map_or(0, |last| last + 1)
-        };
-        if end > 0 {
-            of_block.reset(band, block, tracks);
-            block_moments::<S>(band, block, &list[..end], &of_block, slots, expected, sums);
+    scratch.open.clear();
+    for number in 0..band.tiles() * BLOCKS {
+        let mut inside = [0.0; LANES];
+        band.pixels(number / BLOCKS, number % BLOCKS).for_each(|(lane, _)| inside[lane] = 1.0);
+        scratch.open.push(inside);
+    }
+    let mut first = 0;
+    while first < band.footprints() {
+        scratch.lists.fill::<S>(band, first);
+        for tile in 0..band.tiles() {
+            scratch.tile.gather(&scratch.lists, tile, band.centre(tile));
+            for block in 0..BLOCKS {
+                scratch.add_block::<S>(band, [tile, block], tracks, first, slots, sums);
+            }
         }
+        first += scratch.lists.entries.len();
     }
 }
 
-#[inline(always)]
-fn block_moments<S: Simd>(
-    band: &Band,
-    block: usize,
-    list: &[u32],
-    tracks: &BlockTracks,
-    slots: &[u32],
-    expected: &[ExpectedMotion],
-    sums: &mut [Sums],
-) {
-    let entries: &[Entry] = &band.lists.entries;
-    let (column, row) = corner(block);
-    let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
-    let (zero, least) = (S::splat(0.0), S::splat(TRANSMITTANCE_MIN));
-    let middle = S::splat((BLOCK as f32 - 1.0) / 2.0);
-    let mut rows = [0.0; LANES];
-    for (lane, row) in rows.iter_mut().enumerate() {
-        *row = (lane / BLOCK) as f32;
+impl Scratch {
+    /// One block in the round that begins with footprint `first`.
+    #[inline(always)]
+    fn add_block<S: Simd>(
+        &mut self,
+        band: &BandView<'_>,
+        [tile, block]: [usize; 2],
+        tracks: &TrackField,
+        first: usize,
+        slots: Slots<'_>,
+        sums: &mut [Sums],
+    ) {
+        let Self { lists, tile: seen, open, of_block, live } = self;
+        let count = seen.list::<S>(block);
+        let listed = lists.of(tile);
+        let slot_of = Places { listed, first, slots };
+        let stored = &mut open[tile * BLOCKS + block];
+        let mut open = Open::<S>::load(stored);
+        let list = seen.listed(count);
+        // What lies behind the last footprint that has sums matters to a later round only.
+        let is_last = first + lists.entries.len() == band.footprints();
+        let end = if slots.expected.is_empty() || !is_last {
+            list.len()
+        } else {
+            list.iter().rposition(|&place| slot_of.of(place) != NONE).map_or(0, |last| last + 1)
+        };
+        if end == 0 || !open.is_any() {
+            return;
+        }
+        of_block.reset(band, tile, block, tracks);
+        live.block_moments::<S>(seen, block, &list[..end], of_block, slot_of, &mut open, sums);
+        open.store(stored);
     }
-    let offsets = [S::load(&COLUMNS).sub(middle), S::load(&rows).sub(middle)];
-    let mut features = [zero; LANES];
-    for (feature, values) in features.iter_mut().zip(&tracks.features) {
-        *feature = S::load(values);
-    }
-    let mut inside = [0.0; LANES];
-    for (inside, values) in inside.iter_mut().zip(&tracks.features) {
-        *inside = values[feature::BLEND_WEIGHT];
-    }
-    let mut running = S::load(&inside);
-    let mut alphas = [zero; BATCH];
-    let mut live = Live::default();
-    for (number, batch) in list.chunks(BATCH).enumerate() {
-        for &later in list.iter().skip((number + 1) * BATCH).take(BATCH) {
-            prefetch(&entries[later as usize]);
-            if expected.is_empty() {
-                prefetch(&sums[later as usize]);
-            }
-        }
-        for (alpha, &entry) in alphas.iter_mut().zip(batch) {
-            let entry = &entries[entry as usize];
-            let value = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
-            *alpha = S::select(value.ge(S::splat(ALPHA_MIN)), value, zero);
-        }
-        live.count = 0;
-        for (&alpha, &entry) in alphas.iter().zip(batch) {
-            // As in `blend`: falls on where blending has stopped.
-            let weight = running.mul(alpha);
-            running = running.sub(weight);
-            let mut weight = S::select(running.ge(least), weight, zero);
-            if !S::any(zero.lt(weight)) {
-                continue;
-            }
-            let mut slot = entry;
-            if !expected.is_empty() {
-                slot = slots[entry as usize];
-                let Some(motion) = expected.get(slot as usize) else { continue };
-                weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks, offsets));
-            }
-            weight.store(&mut live.weights[live.count].0);
-            live.slots[live.count] = slot;
-            live.count += 1;
-        }
-        live.add::<S>(tracks, &features, sums);
-        if !S::any(running.ge(least)) {
-            break;
-        }
+}
+
+/// From a place in a tile's list to the sums of its footprint.
+#[derive(Clone, Copy)]
+struct Places<'a> {
+    listed: &'a [Listed],
+    first: usize,
+    slots: Slots<'a>,
+}
+
+impl Places<'_> {
+    #[inline(always)]
+    fn of(&self, place: u32) -> u32 {
+        self.slots.of(self.first + self.listed[place as usize].place())
     }
 }
 
@@ -345,6 +360,57 @@ struct Live {
 }
 
 impl Live {
+    #[inline(always)]
+    fn block_moments<S: Simd>(
+        &mut self,
+        tile: &Tile,
+        block: usize,
+        list: &[u32],
+        tracks: &BlockTracks,
+        places: Places<'_>,
+        open: &mut Open<S>,
+        sums: &mut [Sums],
+    ) {
+        let zero = S::splat(0.0);
+        let at = Offsets::<S>::new(block);
+        let mut features = [zero; LANES];
+        for (feature, values) in features.iter_mut().zip(&tracks.features) {
+            *feature = S::load(values);
+        }
+        let mut alphas = [zero; BATCH];
+        for (number, batch) in list.chunks(BATCH).enumerate() {
+            for &later in list.iter().skip((number + 1) * BATCH).take(BATCH) {
+                if let Some(sums) = sums.get(places.of(later) as usize) {
+                    prefetch(sums);
+                }
+            }
+            for (alpha, &place) in alphas.iter_mut().zip(batch) {
+                *alpha = tile.seen[place as usize].alpha(&at);
+            }
+            self.count = 0;
+            for (&alpha, &place) in alphas.iter().zip(batch) {
+                let (mut weight, _) = open.pass(alpha);
+                if !S::any(zero.lt(weight)) {
+                    continue;
+                }
+                let slot = places.of(place);
+                if slot == NONE {
+                    continue;
+                }
+                if let Some(motion) = places.slots.expected.get(slot as usize) {
+                    weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks, block, &at));
+                }
+                weight.store(&mut self.weights[self.count].0);
+                self.slots[self.count] = slot;
+                self.count += 1;
+            }
+            self.add::<S>(tracks, &features, sums);
+            if !open.is_any() {
+                break;
+            }
+        }
+    }
+
     #[inline(always)]
     fn add<S: Simd>(&self, tracks: &BlockTracks, features: &[S; LANES], sums: &mut [Sums]) {
         let (zero, one) = (S::splat(0.0), S::splat(1.0));

@@ -8,8 +8,8 @@ use rayon::prelude::*;
 
 use super::{
     bin::Bins,
-    blend::Band,
-    block_moments::{NONE, PIXELS, Sums, WEIGHT_SQUARED, add_moments, feature},
+    block_moments::{NONE, PIXELS, Scratch, Slots, Sums, WEIGHT_SQUARED, add_moments, feature},
+    blocks::{BandView, RoundLimit},
     project::project,
 };
 use crate::{
@@ -39,8 +39,7 @@ pub(super) fn footprint_moments(
     let mut bins = Bins::default();
     project(instructions, gaussians, camera, 0, &mut bins.projection);
     bins.sort(camera.height, &mut Vec::new());
-    let mut view = View { instructions, bins: &bins, tracks, bands: Vec::new() };
-    view.list(camera);
+    let view = View { instructions, bins: &bins, camera, tracks };
     let of_bands = view.sums();
     let count = gaussians.len();
     let mut moments: Vec<FootprintMoments> =
@@ -82,30 +81,25 @@ fn check(camera: &Camera, tracks: &TrackField) -> Result<(), EngineError> {
 struct View<'a> {
     instructions: Instructions,
     bins: &'a Bins,
+    camera: &'a Camera,
     tracks: &'a TrackField,
-    bands: Vec<Band>,
 }
 
 impl View<'_> {
-    /// Lists the footprints of every block.
-    fn list(&mut self, camera: &Camera) {
-        let (width, height) = (camera.width as usize, camera.height as usize);
-        let (bins, instructions) = (self.bins, self.instructions);
-        self.bands.resize_with(bins.bands(), Band::default);
-        self.bands
-            .par_iter_mut()
-            .enumerate()
-            .for_each(|(number, band)| band.reset(instructions, bins, number, width, height, &[]));
+    fn band(&self, number: usize) -> BandView<'_> {
+        let (width, height) = (self.camera.width as usize, self.camera.height as usize);
+        BandView { bins: self.bins, number, width, height, active: &[], limit: RoundLimit::default() }
     }
 
     /// The sums of each band's footprints.
     fn sums(&self) -> Vec<Vec<Sums>> {
-        let of_band = |(number, band): (usize, &Band)| {
+        let slots = Slots { of_footprint: &[], expected: &[] };
+        let of_band = |scratch: &mut Scratch, number: usize| {
             let mut sums = vec![ZERO; self.bins.band(number).len()];
-            add_moments(self.instructions, band, self.tracks, &[], &[], &mut sums);
+            add_moments(self.instructions, scratch, &self.band(number), self.tracks, slots, &mut sums);
             sums
         };
-        self.bands.par_iter().enumerate().map(of_band).collect()
+        (0..self.bins.bands()).into_par_iter().map_init(Scratch::default, of_band).collect()
     }
 
     /// The sums of the Gaussians, of `count`, whose pixels are reweighted by an expected motion; in their order.
@@ -114,23 +108,25 @@ impl View<'_> {
         for (number, (index, _)) in expected.iter().enumerate() {
             expectation_of[*index as usize] = number as u32;
         }
-        let of_band = |(number, band): (usize, &Band)| {
+        let of_band = |scratch: &mut Scratch, number: usize| {
             let (mut slots, mut numbers, mut motions) = (Vec::new(), Vec::new(), Vec::new());
             for &index in self.bins.band(number) {
-                let number = expectation_of[index as usize];
-                slots.push(if number == NONE { NONE } else { numbers.len() as u32 });
-                if number != NONE {
-                    numbers.push(number as usize);
-                    motions.push(expected[number as usize].1);
+                let expectation = expectation_of[index as usize];
+                slots.push(if expectation == NONE { NONE } else { numbers.len() as u32 });
+                if expectation != NONE {
+                    numbers.push(expectation as usize);
+                    motions.push(expected[expectation as usize].1);
                 }
             }
             let mut sums = vec![ZERO; motions.len()];
             if !motions.is_empty() {
-                add_moments(self.instructions, band, self.tracks, &slots, &motions, &mut sums);
+                let slots = Slots { of_footprint: &slots, expected: &motions };
+                add_moments(self.instructions, scratch, &self.band(number), self.tracks, slots, &mut sums);
             }
             (numbers, sums)
         };
-        let of_bands: Vec<(Vec<usize>, Vec<Sums>)> = self.bands.par_iter().enumerate().map(of_band).collect();
+        let of_bands: Vec<(Vec<usize>, Vec<Sums>)> =
+            (0..self.bins.bands()).into_par_iter().map_init(Scratch::default, of_band).collect();
         let mut totals: Vec<(usize, Sums)> =
             expected.iter().map(|(index, _)| (*index as usize, ZERO)).collect();
         for (numbers, sums) in &of_bands {

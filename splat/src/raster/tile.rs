@@ -67,8 +67,8 @@ impl Seen {
 
 /// Offsets of a block's pixels from the centre of its tile.
 pub(super) struct Offsets<S> {
-    x: S,
-    y: S,
+    pub x: S,
+    pub y: S,
 }
 
 impl<S: Simd> Offsets<S> {
