@@ -69,13 +69,14 @@ fn rows_of(extreme: &'static str, remark: &str, target: f32, change: fn(&mut Gau
     let mut same = Row::new("session", extreme, EXACT).remark("twice the same bytes, every loss a number");
     let mut start = blobs(5, 31);
     change(&mut start);
-    let (end, losses) = optimised(&start, target, Instructions::detect());
     let farthest = |rate: f32| STEPS as f64 * f64::from(rate) * (1.0 - 0.9) / (1.0_f64 - 0.999).sqrt();
-    let ways = parameters(&start).into_iter().zip(parameters(&end));
-    way.case_of(ways.map(|((from, rate), (to, _))| ((to - from).abs() / farthest(rate), 1.0)));
-    same.exact(losses.iter().all(|loss| loss.is_finite()));
-    let again = optimised(&start, target, Instructions::detect());
-    same.exact(again == (end, losses));
+    for instructions in Instructions::available() {
+        let (end, losses) = optimised(&start, target, instructions);
+        let ways = parameters(&start).into_iter().zip(parameters(&end));
+        way.case_of(ways.map(|((from, rate), (to, _))| ((to - from).abs() / farthest(rate), 1.0)));
+        same.exact(losses.iter().all(|loss| loss.is_finite()));
+        same.exact(optimised(&start, target, instructions) == (end, losses));
+    }
     [way, same]
 }
 
