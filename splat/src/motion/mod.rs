@@ -10,6 +10,7 @@
 //! | motion of unobserved Gaussians from agreeing neighbours | `propagate` |
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
+//! | the released code's own path, to compare with | `reference` |
 //!
 //! Solves run in double precision; sums are in index order, so that the result does not depend on the number
 //! of threads.
@@ -22,6 +23,7 @@ pub mod moments;
 mod neighbours;
 mod observe;
 mod propagate;
+pub mod reference;
 mod regularize;
 mod rotation;
 mod settings;
@@ -34,7 +36,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use apply::apply;
-pub use settings::MotionSettings;
+pub use settings::{LiftMethod, MotionSettings};
 
 use crate::{
     engine::{Engine, EngineError},
@@ -71,6 +73,8 @@ pub struct MotionField {
     pub origin: Vec<MotionOrigin>,
     /// Information matrix of each translation, 1 / world unit²: zero where nothing was observed.
     pub information: Vec<glam::DMat3>,
+    /// Whether the spherical harmonics turn with the Gaussians.
+    pub turns_harmonics: bool,
 }
 
 /// One view's camera and its tracks from the key frame to the target frame.
@@ -93,6 +97,9 @@ pub fn estimate(
     views: &[MotionView],
     settings: &MotionSettings,
 ) -> Result<MotionField, EngineError> {
+    if settings.lift == LiftMethod::Reference {
+        return reference::estimate(engine, gaussians, views);
+    }
     let observations = observe::observe(engine, gaussians, views, settings)?;
     let neighbourhood = Neighbourhood::new(gaussians, settings)?;
     let context = Context { gaussians, neighbourhood: &neighbourhood, settings };
@@ -187,6 +194,7 @@ fn field(
         rotation: states.iter().map(|state| state.rotation).collect(),
         origin: states.iter().map(|state| state.origin).collect(),
         information: (0..states.len()).into_par_iter().map(information).collect(),
+        turns_harmonics: true,
     }
 }
 
