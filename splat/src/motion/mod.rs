@@ -86,6 +86,23 @@ pub struct MotionView {
     pub tracks: std::sync::Arc<crate::tracking::TrackField>,
 }
 
+/// A step of [`estimate`], in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MotionStage {
+    /// Moments and fits of all footprints.
+    Observe,
+    /// The nearest neighbours.
+    Neighbours,
+    /// Who rests, and the positions of those who do not.
+    Lift,
+    /// Rotations of the solved.
+    Turn,
+    /// Motion for the unobserved.
+    Propagate,
+    /// The neighbours' field.
+    Regularise,
+}
+
 /// Motion of every Gaussian of the static model to the frame that the tracks lead to.
 ///
 /// # Errors
@@ -97,20 +114,40 @@ pub fn estimate(
     views: &[MotionView],
     settings: &MotionSettings,
 ) -> Result<MotionField, EngineError> {
+    estimate_staged(engine, gaussians, views, settings, &mut |_| ())
+}
+
+/// [`estimate`], with a call as each stage is entered: for those who time them. The reference path has no stages.
+///
+/// # Errors
+/// Those of [`estimate`].
+pub fn estimate_staged(
+    engine: &dyn Engine,
+    gaussians: &Gaussians,
+    views: &[MotionView],
+    settings: &MotionSettings,
+    entered: &mut dyn FnMut(MotionStage),
+) -> Result<MotionField, EngineError> {
     if settings.lift == LiftMethod::Reference {
         return reference::estimate(engine, gaussians, views);
     }
+    entered(MotionStage::Observe);
     let observations = observe::observe(engine, gaussians, views, settings)?;
+    entered(MotionStage::Neighbours);
     let neighbourhood = Neighbourhood::new(gaussians, settings)?;
     let context = Context { gaussians, neighbourhood: &neighbourhood, settings };
+    entered(MotionStage::Lift);
     let mut states: Vec<State> = observations
         .par_iter()
         .enumerate()
         .map(|(index, observations)| solve_alone(gaussians.mean(index), observations, views, settings))
         .collect();
     propagate::retract_unverified(&mut states, &context);
+    entered(MotionStage::Turn);
     turn_solved(&mut states, &observations, views, &context);
+    entered(MotionStage::Propagate);
     propagate::propagate(&mut states, &context);
+    entered(MotionStage::Regularise);
     regularize::regularize(&mut states, &context);
     Ok(field(gaussians, &states, &observations, views))
 }
