@@ -21,13 +21,15 @@ use super::{Arguments, Tracks};
 /// Index of the key frame.
 const KEY: usize = 0;
 
+/// Tracks of each training view; the field of frame index `i + 1` is at `i`.
+type FieldsByView = BTreeMap<usize, Vec<Arc<TrackField>>>;
+
 /// Everything that the frames of a clip are measured from.
 pub(crate) struct ClipInput {
     pub(crate) name: String,
     pub(crate) clip: Clip,
     pub(crate) static_model: Gaussians,
-    /// By source and view; the field of frame index `i + 1` is at `i`.
-    tracks: Vec<(Tracks, BTreeMap<usize, Vec<Arc<TrackField>>>)>,
+    tracks: Vec<(Tracks, FieldsByView)>,
 }
 
 impl ClipInput {
@@ -125,12 +127,7 @@ fn reconstruct(clip: &Clip, settings: &Settings) -> Result<Gaussians> {
 }
 
 /// Tracks of every training view up to frame number `last`.
-fn read_tracks(
-    clip: &Clip,
-    source: Tracks,
-    last: usize,
-    settings: &Settings,
-) -> Result<BTreeMap<usize, Vec<Arc<TrackField>>>> {
+fn read_tracks(clip: &Clip, source: Tracks, last: usize, settings: &Settings) -> Result<FieldsByView> {
     let training: Vec<usize> = views(clip, Split::Train).collect();
     let of_view = |&view: &usize| -> Result<(usize, Vec<Arc<TrackField>>)> {
         let fields = match source {
