@@ -25,7 +25,7 @@ pub(crate) enum Bench {
     /// its options.
     #[command(disable_help_flag = true)]
     Lift {
-        /// Passed on: --gaussians N, --seed N, --json, --verbose.
+        /// Passed on: --gaussians N, --seed N, --set KEY=VALUE, --json, --verbose.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },

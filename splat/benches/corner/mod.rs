@@ -132,10 +132,13 @@ impl Motion {
     }
 }
 
-/// Lines along the vertical become arcs in the plane of the vertical and the diagonal.
+/// Lines along the vertical become arcs in the plane of the vertical and the diagonal; those of the neutral surface
+/// keep their length.
 fn bent(x: DVec3) -> DVec3 {
     let across = DVec3::new(1.0, 1.0, 0.0).normalize();
-    let (height, depth) = (x.z, x.dot(across));
+    // The vertical walls reach from the neutral surface as far to either side: ±13 % of stretch.
+    let neutral = -0.25 * 2f64.sqrt() * SIDE;
+    let (height, depth) = (x.z, x.dot(across) - neutral);
     let radius = 1.0 / CURVATURE;
     let angle = CURVATURE * height;
     let new_height = (radius - depth) * angle.sin();

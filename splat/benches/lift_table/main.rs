@@ -8,8 +8,9 @@ mod fits;
 mod measure;
 mod report;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use clap::Parser;
+use splat::motion::MotionSettings;
 
 use self::{
     corner::Motion,
@@ -26,6 +27,9 @@ struct Arguments {
     /// Seed of scene and noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// One setting of the robust path, over the defaults, as in `--set neighbours=24`; may be repeated.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -47,11 +51,13 @@ const NOISE: [f64; 3] = [0.0, 0.02, 0.1];
 
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
+    let settings = settings(&arguments.set)?;
     let mut cells = Vec::new();
     for motion in [Motion::Rigid, Motion::Bend] {
         for rig in RIGS {
             for noise in NOISE {
-                cells.push(Cell::measure(motion, rig, noise, arguments.gaussians, arguments.seed)?);
+                let (count, seed) = (arguments.gaussians, arguments.seed);
+                cells.push(Cell::measure(motion, rig, noise, count, seed, &settings)?);
             }
         }
     }
@@ -62,4 +68,13 @@ fn main() -> Result<()> {
     }
     println!("{}", report.table(arguments.verbose));
     Ok(())
+}
+
+fn settings(assignments: &[String]) -> Result<MotionSettings> {
+    let mut settings = serde_json::to_value(MotionSettings::default())?;
+    for assignment in assignments {
+        let (key, value) = assignment.split_once('=').context("write --set KEY=VALUE")?;
+        settings[key] = serde_json::from_str(value).with_context(|| format!("--set {assignment}"))?;
+    }
+    serde_json::from_value(settings).context("--set")
 }

@@ -71,7 +71,14 @@ pub(crate) struct Cell {
 
 impl Cell {
     /// Both paths on the same fits.
-    pub(crate) fn measure(motion: Motion, rig: Rig, noise: f64, gaussians: usize, seed: u64) -> Result<Self> {
+    pub(crate) fn measure(
+        motion: Motion,
+        rig: Rig,
+        noise: f64,
+        gaussians: usize,
+        seed: u64,
+        settings: &MotionSettings,
+    ) -> Result<Self> {
         let gaussians = corner::gaussians(gaussians, seed);
         let cameras = corner::arc(rig.views, rig.half_angle, IMAGE);
         let engine = NoisyFits::new(&gaussians, &cameras, motion, noise, seed)?;
@@ -81,7 +88,7 @@ impl Cell {
             .map(|(camera, tracks)| MotionView { camera, tracks: Arc::new(tracks) })
             .collect();
         let run = |lift: LiftMethod| {
-            let settings = MotionSettings { lift, ..MotionSettings::default() };
+            let settings = MotionSettings { lift, ..settings.clone() };
             motion::estimate(&engine, &gaussians, &views, &settings)
         };
         let own = reference::solve(&engine, &gaussians, &views)?;

@@ -1,6 +1,7 @@
 //! What motion compensation costs, stage by stage, on one core. `cargo xtask bench motion` runs it.
 #![allow(clippy::print_stdout, reason = "a command line prints")]
 
+mod clock;
 #[path = "../corner/mod.rs"]
 mod corner;
 #[path = "../machine/mod.rs"]

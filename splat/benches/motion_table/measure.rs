@@ -2,7 +2,7 @@
 
 use std::{
     sync::{Arc, Mutex, PoisonError},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use anyhow::{Context, Result};
@@ -16,7 +16,10 @@ use splat::{
     tracking::TrackField,
 };
 
-use super::corner::{self, Motion};
+use super::{
+    clock::now,
+    corner::{self, Motion},
+};
 
 /// Size of the track fields.
 const IMAGE: (u32, u32) = (640, 360);
@@ -73,16 +76,16 @@ impl Row {
 
     fn run(&mut self, gaussians: &Gaussians, views: &[MotionView]) -> Result<()> {
         let engine = Timed { engine: CpuEngine::default(), moments: Mutex::default() };
-        let mut entered: Vec<(MotionStage, Instant)> = Vec::new();
+        let mut entered: Vec<(MotionStage, Duration)> = Vec::new();
         let field =
             motion::estimate_staged(&engine, gaussians, views, &MotionSettings::default(), &mut |stage| {
-                entered.push((stage, Instant::now()));
+                entered.push((stage, now()));
             })?;
-        let end = Instant::now();
+        let end = now();
         let moments = engine.spent();
         for (number, &(stage, start)) in entered.iter().enumerate() {
             let until = entered.get(number + 1).map_or(end, |(_, next)| *next);
-            let took = until - start;
+            let took = until.saturating_sub(start);
             match stage {
                 MotionStage::Observe => {
                     self.keep(0, moments);
@@ -96,7 +99,7 @@ impl Row {
             }
         }
         let (_, start) = entered.first().context("the robust path enters its stages")?;
-        self.whole = self.whole.min(milliseconds(end - *start));
+        self.whole = self.whole.min(milliseconds(end.saturating_sub(*start)));
         let share = |of: MotionOrigin| {
             field.origin.iter().filter(|&&origin| origin == of).count() as f64 / gaussians.len() as f64
         };
@@ -145,9 +148,9 @@ impl Engine for Timed {
         camera: &Camera,
         tracks: &TrackField,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
-        let start = Instant::now();
+        let start = now();
         let moments = self.engine.footprint_moments(gaussians, camera, tracks);
-        *self.moments.lock().unwrap_or_else(PoisonError::into_inner) += start.elapsed();
+        *self.moments.lock().unwrap_or_else(PoisonError::into_inner) += now().saturating_sub(start);
         moments
     }
 

@@ -10,6 +10,9 @@ use super::{
     measure::{Row, STAGES},
 };
 
+/// Milliseconds that the clock may be off by twice; shorter stages have no growth.
+const LEAST_TIME: f64 = 8.0;
+
 /// Everything that a run found out; times in milliseconds.
 #[derive(Debug, Serialize)]
 pub(crate) struct Report {
@@ -44,7 +47,8 @@ impl Report {
         if !self.growth.is_empty() {
             let mut cells = vec!["growth".to_owned(), String::new()];
             let names = STAGES.iter().chain(&["whole"]);
-            cells.extend(names.map(|name| format!("{:.2}", self.growth[name])));
+            let growth = |name| self.growth.get(name).map_or("-".into(), |growth| format!("{growth:.2}"));
+            cells.extend(names.map(growth));
             cells.extend([String::new(), String::new()]);
             table.add_row(cells);
         }
@@ -52,7 +56,8 @@ impl Report {
             column.set_cell_alignment(CellAlignment::Right);
         }
         format!(
-            "{}\n\n{table}\n\nMilliseconds on one core, the fastest of the repeats by stage; tracks of 640x360.\n\
+            "{}\n\n{table}\n\nMilliseconds of processor time (where the system tells) of one thread, the fastest of the repeats by stage; tracks \
+             of 640x360.\n\
              growth: exponent of N from the smallest to the largest scene; 1 is linear.",
             self.machine
         )
@@ -70,7 +75,8 @@ fn growth(rows: &[Row]) -> BTreeMap<&'static str, f64> {
         |from: f64, to: f64| (to / from).ln() / (large.gaussians as f64 / small.gaussians as f64).ln();
     let by_stage = STAGES.into_iter().zip(small.stages.into_iter().zip(large.stages));
     by_stage
+        .chain([("whole", (small.whole, large.whole))])
+        .filter(|(_, (from, _))| *from >= LEAST_TIME)
         .map(|(stage, (from, to))| (stage, exponent(from, to)))
-        .chain([("whole", exponent(small.whole, large.whole))])
         .collect()
 }
