@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use splat::{
+    motion::LiftMethod,
     raster::CpuEngine,
     settings::{MotionSource, Quality},
     simd::{InstructionSet, Instructions},
@@ -62,6 +63,10 @@ pub(crate) struct SettingsArgs {
     #[arg(long, value_enum, help_heading = "Reconstruction")]
     pub(crate) motion: Option<MotionArg>,
 
+    /// How tracks become motion [default: robust]; `reference` is an ablation, to compare with.
+    #[arg(long, value_enum, help_heading = "Reconstruction")]
+    pub(crate) lift: Option<LiftArg>,
+
     /// Seed of every random choice [default: 0].
     #[arg(long, help_heading = "Reconstruction")]
     pub(crate) seed: Option<u64>,
@@ -96,6 +101,15 @@ pub(crate) enum MotionArg {
     None,
 }
 
+/// [`LiftMethod`] on the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LiftArg {
+    /// The project's own motion compensation.
+    Robust,
+    /// Ablation: the path of TrackerSplat's released code, with its thresholds and its defects.
+    Reference,
+}
+
 impl From<QualityArg> for Quality {
     fn from(quality: QualityArg) -> Self {
         match quality {
@@ -115,6 +129,15 @@ impl From<MotionArg> for MotionSource {
     }
 }
 
+impl From<LiftArg> for LiftMethod {
+    fn from(lift: LiftArg) -> Self {
+        match lift {
+            LiftArg::Robust => Self::Robust,
+            LiftArg::Reference => Self::Reference,
+        }
+    }
+}
+
 impl JobArgs {
     /// The submission for a coordinator; paths become absolute, because it runs in another folder.
     pub(crate) fn request(&self, output: Option<&Path>) -> Result<SubmitRequest, CliError> {
@@ -123,6 +146,7 @@ impl JobArgs {
             file: self.settings.settings.as_deref(),
             assignments: &self.settings.set,
             motion: self.settings.motion.map(Into::into),
+            lift: self.settings.lift.map(Into::into),
             seed: self.settings.seed,
         };
         let settings_json = serde_json::to_string(&layers.resolve()?)
@@ -239,6 +263,8 @@ mod tests {
             "9",
             "--motion",
             "none",
+            "--lift",
+            "reference",
         ];
         let request = request(&line).unwrap();
         assert_eq!(request.clip, "file:///clip");
@@ -248,6 +274,7 @@ mod tests {
         assert!(matches!(request.tracks, Some(Tracks::ExactTracks(_))));
         let settings: splat::settings::Settings = serde_json::from_str(&request.settings_json).unwrap();
         assert_eq!((settings.seed, settings.motion_source), (9, MotionSource::None));
+        assert_eq!(settings.motion.lift, LiftMethod::Reference);
     }
 
     #[test]

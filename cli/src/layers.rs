@@ -4,7 +4,10 @@
 use std::path::Path;
 
 use serde_json::Value;
-use splat::settings::{MotionSource, Quality, Settings};
+use splat::{
+    motion::LiftMethod,
+    settings::{MotionSource, Quality, Settings},
+};
 
 use crate::error::CliError;
 
@@ -16,6 +19,7 @@ pub(crate) struct SettingsLayers<'a> {
     /// `KEY=VALUE`, in order.
     pub(crate) assignments: &'a [String],
     pub(crate) motion: Option<MotionSource>,
+    pub(crate) lift: Option<LiftMethod>,
     pub(crate) seed: Option<u64>,
 }
 
@@ -33,6 +37,7 @@ impl SettingsLayers<'_> {
         }
         let mut settings = layered.settings().map_err(|error| CliError::failed("the settings", error))?;
         settings.motion_source = self.motion.unwrap_or(settings.motion_source);
+        settings.motion.lift = self.lift.unwrap_or(settings.motion.lift);
         settings.seed = self.seed.unwrap_or(settings.seed);
         Ok(settings)
     }
@@ -158,15 +163,17 @@ mod tests {
         assert_eq!(settings.masks, splat::settings::MaskUse::Train);
         assert_eq!(settings.motion_source, MotionSource::None);
 
-        let assignments = ["seed=5".to_owned(), "motion_source=none".to_owned()];
+        let assignments = ["seed=5", "motion_source=none", "motion.lift=reference"].map(str::to_owned);
         let flags = SettingsLayers {
             assignments: &assignments,
             motion: Some(MotionSource::Tracks),
+            lift: Some(LiftMethod::Robust),
             seed: Some(6),
             ..SettingsLayers::default()
         };
         let settings = flags.resolve().unwrap();
         assert_eq!((settings.seed, settings.motion_source), (6, MotionSource::Tracks));
+        assert_eq!(settings.motion.lift, LiftMethod::Robust);
     }
 
     #[test]

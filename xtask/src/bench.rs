@@ -1,4 +1,4 @@
-//! Benchmarks of the CPU engine.
+//! Benchmarks: the CPU engine, and motion compensation.
 
 use std::{
     path::PathBuf,
@@ -21,6 +21,29 @@ pub(crate) enum Bench {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },
+    /// Errors of position and rotation of the robust lift and of the released code's, on synthetic motion; `--help` has
+    /// its options.
+    #[command(disable_help_flag = true)]
+    Lift {
+        /// Passed on: --gaussians N, --seed N, --set KEY=VALUE, --json, --verbose.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// What motion compensation costs, stage by stage, on one core; `--help` has its options.
+    #[command(disable_help_flag = true)]
+    Motion {
+        /// Passed on: --gaussians N, --views N, --repeat N, --json.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// What compensation is worth before and during refinement, on clips with ground truth: without it, the released
+    /// code's, the robust one; `--help` has its options.
+    #[command(disable_help_flag = true)]
+    Compensation {
+        /// Passed on: --clips DIR, --clip NAMES, --frames, --iterations, --tracks, --quality, --static-models DIR, --json.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
     /// Instructions of one fixed step, stage by stage, against those on record; needs valgrind.
     Instructions {
         /// Put the new counts on record.
@@ -33,14 +56,17 @@ impl Bench {
     /// Measures.
     pub(crate) fn run(self) -> Result<()> {
         match self {
-            Self::Raster { arguments } => raster(&arguments),
+            Self::Raster { arguments } => table("raster_table", &arguments),
+            Self::Lift { arguments } => table("lift_table", &arguments),
+            Self::Motion { arguments } => table("motion_table", &arguments),
+            Self::Compensation { arguments } => table("compensation_table", &arguments),
             Self::Instructions { record } => instructions::run(record),
         }
     }
 }
 
-fn raster(arguments: &[String]) -> Result<()> {
-    let program = build("raster_table")?;
+fn table(name: &str, arguments: &[String]) -> Result<()> {
+    let program = build(name)?;
     let status = Command::new(&program).args(arguments).status().context("cannot start the benchmark")?;
     if !status.success() {
         bail!("the benchmark failed ({status})");

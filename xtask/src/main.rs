@@ -22,7 +22,7 @@ enum Command {
     Test,
     /// Formatting and lints only.
     Lint,
-    /// Speed of the CPU engine: tables, and instruction counts that noise cannot change.
+    /// Tables of speed and of accuracy, and instruction counts that noise cannot change.
     #[command(subcommand)]
     Bench(bench::Bench),
     /// Every stage at its extremes: runs the suite and renews the tables of docs/numerics.md.

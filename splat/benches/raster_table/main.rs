@@ -2,6 +2,7 @@
 #![allow(clippy::print_stdout, reason = "a command line prints")]
 
 mod floor;
+#[path = "../machine/mod.rs"]
 mod machine;
 mod measure;
 mod peers;

@@ -6,7 +6,8 @@ use rayon::prelude::*;
 use super::MotionField;
 use crate::gaussians::{Gaussians, sh};
 
-/// The Gaussians after a motion: means moved, rotations composed, spherical harmonics rotated with them.
+/// The Gaussians after a motion: means moved, rotations composed, spherical harmonics rotated with them if the
+/// field says so.
 ///
 /// Scales and opacities stay, and so does the norm of each stored quaternion. A Gaussian without motion keeps
 /// its bytes.
@@ -22,6 +23,9 @@ pub fn apply(gaussians: &Gaussians, field: &MotionField) -> Gaussians {
             *stored = turned(*stored, *turn);
         }
     });
+    if !field.turns_harmonics {
+        return moved;
+    }
     let stride = moved.sh_coefficients() * 3;
     moved.sh.par_chunks_mut(stride).zip(&field.rotation).for_each(|(coefficients, turn)| {
         if *turn != DQuat::IDENTITY {

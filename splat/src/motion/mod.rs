@@ -10,6 +10,7 @@
 //! | motion of unobserved Gaussians from agreeing neighbours | `propagate` |
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
+//! | the released code's own path, to compare with | `reference` |
 //!
 //! Solves run in double precision; sums are in index order, so that the result does not depend on the number
 //! of threads.
@@ -22,6 +23,7 @@ pub mod moments;
 mod neighbours;
 mod observe;
 mod propagate;
+pub mod reference;
 mod regularize;
 pub mod reweighting;
 mod rotation;
@@ -35,7 +37,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use apply::apply;
-pub use settings::MotionSettings;
+pub use settings::{LiftMethod, MotionSettings};
 
 use crate::{
     engine::{Engine, EngineError},
@@ -72,6 +74,8 @@ pub struct MotionField {
     pub origin: Vec<MotionOrigin>,
     /// Information matrix of each translation, 1 / world unit²: zero where nothing was observed.
     pub information: Vec<glam::DMat3>,
+    /// Whether the spherical harmonics turn with the Gaussians.
+    pub turns_harmonics: bool,
 }
 
 /// One view's camera and its tracks from the key frame to the target frame.
@@ -81,6 +85,23 @@ pub struct MotionView {
     pub camera: crate::cameras::Camera,
     /// Tracks, of the camera's size.
     pub tracks: std::sync::Arc<crate::tracking::TrackField>,
+}
+
+/// A step of [`estimate`], in their order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MotionStage {
+    /// Moments and fits of all footprints.
+    Observe,
+    /// The nearest neighbours.
+    Neighbours,
+    /// Who rests, and the positions of those who do not.
+    Lift,
+    /// Rotations of the solved.
+    Turn,
+    /// Motion for the unobserved.
+    Propagate,
+    /// The neighbours' field.
+    Regularise,
 }
 
 /// Motion of every Gaussian of the static model to the frame that the tracks lead to.
@@ -94,17 +115,40 @@ pub fn estimate(
     views: &[MotionView],
     settings: &MotionSettings,
 ) -> Result<MotionField, EngineError> {
+    estimate_staged(engine, gaussians, views, settings, &mut |_| ())
+}
+
+/// [`estimate`], with a call as each stage is entered: for those who time them. The reference path has no stages.
+///
+/// # Errors
+/// Those of [`estimate`].
+pub fn estimate_staged(
+    engine: &dyn Engine,
+    gaussians: &Gaussians,
+    views: &[MotionView],
+    settings: &MotionSettings,
+    entered: &mut dyn FnMut(MotionStage),
+) -> Result<MotionField, EngineError> {
+    if settings.lift == LiftMethod::Reference {
+        return reference::estimate(engine, gaussians, views);
+    }
+    entered(MotionStage::Observe);
     let observations = observe::observe(engine, gaussians, views, settings)?;
+    entered(MotionStage::Neighbours);
     let neighbourhood = Neighbourhood::new(gaussians, settings)?;
     let context = Context { gaussians, neighbourhood: &neighbourhood, settings };
+    entered(MotionStage::Lift);
     let mut states: Vec<State> = observations
         .par_iter()
         .enumerate()
         .map(|(index, observations)| solve_alone(gaussians.mean(index), observations, views, settings))
         .collect();
     propagate::retract_unverified(&mut states, &context);
+    entered(MotionStage::Turn);
     turn_solved(&mut states, &observations, views, &context);
+    entered(MotionStage::Propagate);
     propagate::propagate(&mut states, &context);
+    entered(MotionStage::Regularise);
     regularize::regularize(&mut states, &context);
     Ok(field(gaussians, &states, &observations, views))
 }
@@ -188,6 +232,7 @@ fn field(
         rotation: states.iter().map(|state| state.rotation).collect(),
         origin: states.iter().map(|state| state.origin).collect(),
         information: (0..states.len()).into_par_iter().map(information).collect(),
+        turns_harmonics: true,
     }
 }
 

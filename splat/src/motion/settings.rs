@@ -4,6 +4,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::settings::Quality;
 
+/// Which path leads from footprints to motion.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LiftMethod {
+    /// Robust fits, Gauss-Newton lift, one sparse solve over the neighbours.
+    #[default]
+    Robust,
+    /// TrackerSplat's released path with its thresholds and defects, as an ablation: no other setting of motion
+    /// compensation applies to it.
+    Reference,
+}
+
 /// How Gaussians are moved from tracks.
 ///
 /// Pixels are those of the track fields. The discard thresholds follow the paper and its public code where
@@ -11,6 +23,8 @@ use crate::settings::Quality;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionSettings {
+    /// Which path leads from footprints to motion; default `robust`.
+    pub lift: LiftMethod,
     /// Least sum of blending weights `alpha * T` of a footprint that counts as observed in a view; default
     /// 1e-3, as in the public code.
     pub min_blend_weight: f64,
@@ -93,6 +107,7 @@ impl MotionSettings {
     pub fn preset(quality: Quality) -> Self {
         let is_draft = quality == Quality::Draft;
         Self {
+            lift: LiftMethod::default(),
             min_blend_weight: 1e-3,
             min_pixels: 2,
             min_determinant: 1e-12,

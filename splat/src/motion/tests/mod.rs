@@ -219,6 +219,7 @@ fn moved_gaussians_look_the_same_from_the_moved_camera() {
         rotation: vec![truth.turn; 90],
         origin: vec![MotionOrigin::Solved; 90],
         information: vec![glam::DMat3::ZERO; 90],
+        turns_harmonics: true,
     };
     let moved = apply(&gaussians, &field);
     let camera = &cameras(1)[0];
