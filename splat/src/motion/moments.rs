@@ -31,6 +31,8 @@ pub struct FootprintMoments {
     pub target: f64,
     /// `Σ w σ²`, the track variance summed with the weights.
     pub variance: f64,
+    /// What an affine map left of the tracks before reweighting, px² per axis; zero without reweighting.
+    pub contest: f64,
 }
 
 /// The same in displacements, divided by the weight.

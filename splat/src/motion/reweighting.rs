@@ -68,8 +68,13 @@ impl FootprintMoments {
     /// does where hardly any weight is left.
     pub fn reweigh(&mut self, reweighted: Self) {
         if reweighted.weight > LEAST_SHARE * self.weight && reweighted.weight_squared > 0.0 {
+            let residual = |first: Displacements| 0.5 * first.affine_residual_power();
+            let contest = match self.contest {
+                0.0 => Displacements::of(self).map_or(0.0, residual),
+                first => first,
+            };
             let Self { blend_weight, visible, pixels, .. } = *self;
-            *self = Self { blend_weight, visible, pixels, ..reweighted };
+            *self = Self { blend_weight, visible, pixels, contest, ..reweighted };
         }
     }
 }

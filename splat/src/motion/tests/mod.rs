@@ -5,6 +5,7 @@ mod clip;
 mod dense;
 mod extremes;
 mod moments;
+mod orders;
 mod parts;
 mod scenes;
 
@@ -220,6 +221,8 @@ fn moved_gaussians_look_the_same_from_the_moved_camera() {
         origin: vec![MotionOrigin::Solved; 90],
         information: vec![glam::DMat3::ZERO; 90],
         turns_harmonics: true,
+        log_scale: vec![DVec3::ZERO; 90],
+        orders: OrderCounts::default(),
     };
     let moved = apply(&gaussians, &field);
     let camera = &cameras(1)[0];
