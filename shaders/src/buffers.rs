@@ -6,7 +6,7 @@ use wgpu::{BindingResource, Buffer, BufferBinding, BufferDescriptor, BufferSize,
 
 use crate::{
     device::GpuDevice,
-    layout::{GEOMETRY, ScanSettings, SortSettings, State, Step, View},
+    layout::{GEOMETRY, SUMS, ScanSettings, SortSettings, State, Step, View},
 };
 
 /// Elements of one block of the sort and of the scan.
@@ -77,6 +77,18 @@ pub(crate) fn interleaved(gaussians: &Gaussians) -> Vec<f32> {
         values.push(gaussians.logit_opacities[index]);
     }
     values
+}
+
+/// The inverse of [`interleaved`].
+pub(crate) fn separated(geometry: &[[f32; GEOMETRY]], sh: Vec<f32>, sh_degree: u32) -> Gaussians {
+    Gaussians {
+        means: geometry.iter().map(|row| [row[0], row[1], row[2]]).collect(),
+        rotations: geometry.iter().map(|row| [row[3], row[4], row[5], row[6]]).collect(),
+        log_scales: geometry.iter().map(|row| [row[7], row[8], row[9]]).collect(),
+        logit_opacities: geometry.iter().map(|row| row[10]).collect(),
+        sh,
+        sh_degree,
+    }
 }
 
 /// The parameters of a set.
@@ -218,12 +230,15 @@ pub(crate) struct IntersectionBuffers {
     /// Tiles and slots.
     pub tiles: SortBuffers,
     pub owners: Buffer,
+    /// Shares of the gradient; empty if none is taken.
+    pub sums: Buffer,
 }
 
 impl IntersectionBuffers {
-    pub(crate) fn new(device: &GpuDevice, capacity: u64) -> Result<Self, EngineError> {
-        let [owners] = allocate(device, [storage("owners", 4 * capacity)])?;
-        Ok(Self { capacity, tiles: SortBuffers::new(device, capacity)?, owners })
+    pub(crate) fn new(device: &GpuDevice, capacity: u64, has_gradient: bool) -> Result<Self, EngineError> {
+        let sums = if has_gradient { 4 * SUMS as u64 * capacity } else { 0 };
+        let [owners, sums] = allocate(device, [storage("owners", 4 * capacity), storage("sums", sums)])?;
+        Ok(Self { capacity, tiles: SortBuffers::new(device, capacity)?, owners, sums })
     }
 }
 
@@ -245,9 +260,60 @@ impl ImageBuffers {
     }
 }
 
-/// A view's uniform.
-pub(crate) fn view_buffer(device: &GpuDevice, view: &View) -> Result<Buffer, EngineError> {
-    let [buffer] = allocate(device, [uniform("view", size_of::<View>() as u64)])?;
-    device.queue.write_buffer(&buffer, 0, bytes_of(view));
-    Ok(buffer)
+/// Gradients by pixels and by parameters, and what densification decides by.
+#[derive(Clone, Debug)]
+pub(crate) struct GradientBuffers {
+    pub image: Buffer,
+    pub geometry: Buffer,
+    pub sh: Buffer,
+    pub density: Buffer,
+}
+
+impl GradientBuffers {
+    /// For sets of `count` Gaussians and images of so many pixels.
+    pub(crate) fn new(
+        device: &GpuDevice,
+        count: u64,
+        coefficients: u64,
+        pixels: u64,
+    ) -> Result<Self, EngineError> {
+        let requests = [
+            storage("gradient by the image", 16 * pixels),
+            storage("gradient by the geometry", 4 * GEOMETRY as u64 * count),
+            storage("gradient by sh", 12 * coefficients * count),
+            storage("density", 8 * count),
+        ];
+        let [image, geometry, sh, density] = allocate(device, requests)?;
+        Ok(Self { image, geometry, sh, density })
+    }
+}
+
+/// Everything that a view is drawn and differentiated with.
+#[derive(Clone, Debug)]
+pub(crate) struct Buffers {
+    pub common: CommonBuffers,
+    pub parameters: ParameterBuffers,
+    pub footprints: FootprintBuffers,
+    pub intersections: IntersectionBuffers,
+    pub images: ImageBuffers,
+    /// Whether intersections have sums.
+    pub has_gradient: bool,
+}
+
+impl Buffers {
+    /// More room for intersections, after a view had `needed`.
+    pub(crate) fn make_room(&mut self, device: &GpuDevice, needed: u32) -> Result<(), EngineError> {
+        let wanted = u64::from(needed);
+        if needed == u32::MAX {
+            return Err(EngineError::OutOfResources { needed: 4 * wanted, available: device.max_buffer() });
+        }
+        let capacity = (wanted + wanted / 4).min(u64::from(u32::MAX) - 1);
+        self.intersections = IntersectionBuffers::new(device, capacity, self.has_gradient)?;
+        Ok(())
+    }
+}
+
+/// Room for intersections to start with: a footprint of a few pixels touches two or three tiles.
+pub(crate) fn first_capacity(count: u64, view: &View) -> u64 {
+    (4 * count).max(u64::from(view.tile_count())).max(1 << 12)
 }

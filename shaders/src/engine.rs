@@ -6,7 +6,7 @@ use bytemuck::bytes_of;
 use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
-    gaussians::Gaussians,
+    gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     motion::moments::FootprintMoments,
     tracking::TrackField,
@@ -14,14 +14,15 @@ use splat::{
 
 use crate::{
     buffers::{
-        CommonBuffers, FootprintBuffers, ImageBuffers, IntersectionBuffers, ParameterBuffers, view_buffer,
+        Buffers, CommonBuffers, FootprintBuffers, GradientBuffers, ImageBuffers, IntersectionBuffers,
+        ParameterBuffers, first_capacity, separated,
     },
     device::GpuDevice,
     kernels::Kernels,
-    layout::{State, Step, View},
+    layout::{GEOMETRY, State, Step, View},
     program::record,
     readback::read,
-    stages::{Binder, Forward},
+    stages::{Binder, ViewBuffer},
 };
 
 /// An opened device and its compiled kernels.
@@ -49,20 +50,91 @@ impl GpuEngine {
     pub fn device(&self) -> &GpuDevice {
         &self.context.device
     }
-}
 
-/// Room for intersections to start with: a footprint of a few pixels touches two or three tiles.
-pub(crate) fn first_capacity(count: u64, view: &View) -> u64 {
-    (4 * count).max(u64::from(view.tile_count())).max(1 << 12)
-}
-
-/// Room for intersections after a view had `needed`.
-pub(crate) fn next_capacity(device: &GpuDevice, needed: u32) -> Result<u64, EngineError> {
-    let needed = u64::from(needed);
-    if needed >= u64::from(u32::MAX) {
-        return Err(EngineError::OutOfResources { needed: 4 * needed, available: device.max_buffer() });
+    /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
+    /// `H × W × 3`, `alpha_gradient` `H × W` or empty.
+    pub fn render_backward(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        image_gradient: &[f32],
+        alpha_gradient: &[f32],
+    ) -> Result<GaussianGradients, EngineError> {
+        camera_has_pixels(camera)?;
+        let Context { device, kernels } = &*self.context;
+        let view = ViewBuffer::new(device, View::new(camera, background))?;
+        let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
+        let coefficients = gaussians.sh_coefficients();
+        let gradients =
+            GradientBuffers::new(device, gaussians.len() as u64, coefficients as u64, view.data.pixels())?;
+        let alpha = alpha_gradient.iter().copied().chain(std::iter::repeat(0.0));
+        let pixels: Vec<f32> = image_gradient
+            .as_chunks::<3>()
+            .0
+            .iter()
+            .zip(alpha)
+            .flat_map(|([red, green, blue], alpha)| [*red, *green, *blue, alpha])
+            .collect();
+        device.queue.write_buffer(&gradients.image, 0, bytemuck::cast_slice(&pixels));
+        let mut encoder = device.device.create_command_encoder(&Default::default());
+        record(&mut encoder, "gradient", &Binder { device, kernels }.backward(&buffers, &gradients, &view));
+        device.queue.submit([encoder.finish()]);
+        let geometry: Vec<[f32; GEOMETRY]> = read(device, &gradients.geometry, gaussians.len())?;
+        let sh = read(device, &gradients.sh, 3 * coefficients * gaussians.len())?;
+        let Gaussians { means, rotations, log_scales, logit_opacities, sh, .. } =
+            separated(&geometry, sh, gaussians.sh_degree);
+        Ok(GaussianGradients { means, rotations, log_scales, logit_opacities, sh })
     }
-    Ok((needed + needed / 4).min(u64::from(u32::MAX)))
+
+    /// Buffers for one view with room for what it probably needs.
+    fn buffers(
+        &self,
+        gaussians: &Gaussians,
+        view: &View,
+        has_gradient: bool,
+    ) -> Result<Buffers, EngineError> {
+        let device = &self.context.device;
+        let count = gaussians.len() as u64;
+        Ok(Buffers {
+            common: CommonBuffers::new(device)?,
+            parameters: ParameterBuffers::new(device, gaussians)?,
+            footprints: FootprintBuffers::new(device, count)?,
+            intersections: IntersectionBuffers::new(device, first_capacity(count, view), has_gradient)?,
+            images: ImageBuffers::new(device, view.pixels(), view.tile_count().into())?,
+            has_gradient,
+        })
+    }
+
+    /// Stages 1 to 3, with more room until there is enough.
+    fn draw(
+        &self,
+        gaussians: &Gaussians,
+        view: &ViewBuffer,
+        mut buffers: Buffers,
+    ) -> Result<Buffers, EngineError> {
+        let Context { device, kernels } = &*self.context;
+        loop {
+            let step = Step {
+                count: gaussians.len() as u32,
+                coefficients: gaussians.sh_coefficients() as u32,
+                degree: gaussians.sh_degree,
+                capacity: buffers.intersections.capacity as u32,
+                ..Step::default()
+            };
+            let state = State { gaussians: step.count, ..State::default() };
+            device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
+            device.queue.write_buffer(&buffers.common.state, 0, bytes_of(&state));
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            record(&mut encoder, "render", &Binder { device, kernels }.forward(&buffers, view));
+            device.queue.submit([encoder.finish()]);
+            let state: Vec<State> = read(device, &buffers.common.state, 1)?;
+            if state[0].failed == 0 {
+                return Ok(buffers);
+            }
+            buffers.make_room(device, state[0].needed)?;
+        }
+    }
 }
 
 impl Engine for GpuEngine {
@@ -77,45 +149,11 @@ impl Engine for GpuEngine {
         background: [f32; 3],
     ) -> Result<Rendering, EngineError> {
         camera_has_pixels(camera)?;
-        let Context { device, kernels } = &*self.context;
-        let view = View::new(camera, background);
-        let count = gaussians.len() as u64;
-        let parameters = ParameterBuffers::new(device, gaussians)?;
-        let common = CommonBuffers::new(device)?;
-        let footprints = FootprintBuffers::new(device, count)?;
-        let images = ImageBuffers::new(device, view.pixels(), view.tile_count().into())?;
-        let view_buffer = view_buffer(device, &view)?;
-        let mut capacity = first_capacity(count, &view);
-        loop {
-            let intersections = IntersectionBuffers::new(device, capacity)?;
-            let buffers = Forward {
-                parameters: &parameters,
-                common: &common,
-                footprints: &footprints,
-                intersections: &intersections,
-                images: &images,
-                view: &view_buffer,
-            };
-            let step = Step {
-                count: count as u32,
-                coefficients: gaussians.sh_coefficients() as u32,
-                degree: gaussians.sh_degree,
-                capacity: capacity as u32,
-                ..Step::default()
-            };
-            let state = State { gaussians: count as u32, ..State::default() };
-            device.queue.write_buffer(&common.step, 0, bytes_of(&step));
-            device.queue.write_buffer(&common.state, 0, bytes_of(&state));
-            let mut encoder = device.device.create_command_encoder(&Default::default());
-            record(&mut encoder, "render", &Binder { device, kernels }.forward(&buffers, &view));
-            device.queue.submit([encoder.finish()]);
-            let state: Vec<State> = read(device, &common.state, 1)?;
-            if state[0].failed == 0 {
-                break;
-            }
-            capacity = next_capacity(device, state[0].needed)?;
-        }
-        let pixels: Vec<[f32; 4]> = read(device, &images.rendered, view.pixels() as usize)?;
+        let view = ViewBuffer::new(&self.context.device, View::new(camera, background))?;
+        let buffers = self.buffers(gaussians, &view.data, false)?;
+        let buffers = self.draw(gaussians, &view, buffers)?;
+        let pixels: Vec<[f32; 4]> =
+            read(&self.context.device, &buffers.images.rendered, view.data.pixels() as usize)?;
         let image = Image {
             width: camera.width,
             height: camera.height,

@@ -22,6 +22,8 @@ pub(crate) const SOURCES: &[(&str, &str)] = &[
     ("scan", composed!("scan")),
     ("sort", composed!("sort")),
     ("blend", composed!("blend")),
+    ("blend_backward", composed!("blend_backward")),
+    ("project_backward", composed!("project_backward")),
 ];
 
 /// An entry point of a stage.
@@ -89,6 +91,8 @@ kernels! {
     "scan": reduce, spine, add;
     "sort": histogram, scatter;
     "blend": blend;
+    "blend_backward": blend_backward;
+    "project_backward": project_backward;
 }
 
 fn compile(device: &Device, name: &'static str) -> ShaderModule {

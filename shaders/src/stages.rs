@@ -1,11 +1,13 @@
 //! The stages of one view as dispatches, each bound to its buffers.
 
+use bytemuck::bytes_of;
+use splat::engine::EngineError;
 use wgpu::{BindingResource, Buffer};
 
 use crate::{
     buffers::{
-        BLOCK, CommonBuffers, DEPTH_PASSES, FootprintBuffers, ImageBuffers, IntersectionBuffers,
-        ParameterBuffers, SortBuffers,
+        BLOCK, Buffers, CommonBuffers, DEPTH_PASSES, GradientBuffers, IntersectionBuffers, SortBuffers,
+        allocate, uniform,
     },
     device::GpuDevice,
     kernels::{Kernel, Kernels},
@@ -17,14 +19,19 @@ use crate::{
 const SORT_GROUPS: u64 = 0;
 const SCAN_GROUPS: u64 = 16;
 
-/// The buffers of the forward stages of one view.
-pub(crate) struct Forward<'a> {
-    pub parameters: &'a ParameterBuffers,
-    pub common: &'a CommonBuffers,
-    pub footprints: &'a FootprintBuffers,
-    pub intersections: &'a IntersectionBuffers,
-    pub images: &'a ImageBuffers,
-    pub view: &'a Buffer,
+/// A view's uniform, here and on the device.
+#[derive(Clone, Debug)]
+pub(crate) struct ViewBuffer {
+    pub data: View,
+    pub buffer: Buffer,
+}
+
+impl ViewBuffer {
+    pub(crate) fn new(device: &GpuDevice, data: View) -> Result<Self, EngineError> {
+        let [buffer] = allocate(device, [uniform("view", size_of::<View>() as u64)])?;
+        device.queue.write_buffer(&buffer, 0, bytes_of(&data));
+        Ok(Self { data, buffer })
+    }
 }
 
 /// Binds kernels to resources.
@@ -45,17 +52,27 @@ impl Binder<'_> {
     }
 
     /// Stages 1 to 3.
-    pub(crate) fn forward(&self, buffers: &Forward<'_>, view: &View) -> Vec<Dispatch> {
-        let mut program = vec![self.project(buffers)];
+    pub(crate) fn forward(&self, buffers: &Buffers, view: &ViewBuffer) -> Vec<Dispatch> {
+        let mut program = vec![self.project(buffers, view)];
         self.bin(buffers, view, &mut program);
         program.push(self.blend(buffers, view));
         program
     }
 
-    fn project(&self, buffers: &Forward<'_>) -> Dispatch {
-        let Forward { parameters, common, footprints, .. } = buffers;
+    /// Stages 4 and 5.
+    pub(crate) fn backward(
+        &self,
+        buffers: &Buffers,
+        gradients: &GradientBuffers,
+        view: &ViewBuffer,
+    ) -> [Dispatch; 2] {
+        [self.blend_backward(buffers, gradients, view), self.project_backward(buffers, gradients, view)]
+    }
+
+    fn project(&self, buffers: &Buffers, view: &ViewBuffer) -> Dispatch {
+        let Buffers { parameters, common, footprints, .. } = buffers;
         let resources = [
-            (0, whole(buffers.view)),
+            (0, whole(&view.buffer)),
             (1, whole(&common.step)),
             (2, whole(&common.state)),
             (3, whole(&parameters.geometry)),
@@ -69,8 +86,8 @@ impl Binder<'_> {
         self.dispatch(&self.kernels.project, Groups::threads(footprints.count), &resources)
     }
 
-    fn bin(&self, buffers: &Forward<'_>, view: &View, program: &mut Vec<Dispatch>) {
-        let Forward { common, footprints, intersections, images, .. } = buffers;
+    fn bin(&self, buffers: &Buffers, view: &ViewBuffer, program: &mut Vec<Dispatch>) {
+        let Buffers { common, footprints, intersections, images, .. } = buffers;
         let blocks = Groups::of(footprints.count.div_ceil(BLOCK));
         let scans = Groups::of((16 * footprints.count.div_ceil(BLOCK)).div_ceil(BLOCK));
         let (depths, order) = self.sort(common, &footprints.depth, 0, DEPTH_PASSES, &blocks, &scans, program);
@@ -78,7 +95,7 @@ impl Binder<'_> {
             &self.kernels.count,
             Groups::threads(footprints.count + 1),
             &[
-                (0, whole(buffers.view)),
+                (0, whole(&view.buffer)),
                 (1, whole(&common.step)),
                 (2, whole(&common.state)),
                 (3, whole(depths)),
@@ -104,7 +121,7 @@ impl Binder<'_> {
             &self.kernels.emit,
             Groups::threads(footprints.count),
             &[
-                (0, whole(buffers.view)),
+                (0, whole(&view.buffer)),
                 (1, whole(&common.step)),
                 (2, whole(&common.state)),
                 (4, whole(order)),
@@ -118,12 +135,12 @@ impl Binder<'_> {
         ));
         let blocks = Groups::Planned(common.dispatches.clone(), SORT_GROUPS);
         let scans = Groups::Planned(common.dispatches.clone(), SCAN_GROUPS);
-        let (keys, _) = self.sort(common, tiles, 1, tile_passes(view), &blocks, &scans, program);
+        let (keys, _) = self.sort(common, tiles, 1, tile_passes(&view.data), &blocks, &scans, program);
         program.push(self.dispatch(
             &self.kernels.bound,
-            Groups::threads(view.tile_count().into()),
+            Groups::threads(view.data.tile_count().into()),
             &[
-                (0, whole(buffers.view)),
+                (0, whole(&view.buffer)),
                 (2, whole(&common.state)),
                 (14, whole(keys)),
                 (15, whole(&images.bounds)),
@@ -184,19 +201,57 @@ impl Binder<'_> {
         program.push(self.dispatch(&self.kernels.add, groups.clone(), &all));
     }
 
-    fn blend(&self, buffers: &Forward<'_>, view: &View) -> Dispatch {
-        let Forward { common, footprints, intersections, images, .. } = buffers;
+    fn blend(&self, buffers: &Buffers, view: &ViewBuffer) -> Dispatch {
+        let Buffers { common, footprints, intersections, images, .. } = buffers;
         let resources = [
-            (0, whole(buffers.view)),
+            (0, whole(&view.buffer)),
             (1, whole(&common.state)),
             (2, whole(&images.bounds)),
-            (3, whole(sorted_slots(intersections, view))),
+            (3, whole(sorted_slots(intersections, &view.data))),
             (4, whole(&intersections.owners)),
             (5, whole(&footprints.footprints)),
             (6, whole(&images.rendered)),
             (7, whole(&images.last)),
         ];
-        self.dispatch(&self.kernels.blend, Groups::of(view.tile_count().into()), &resources)
+        self.dispatch(&self.kernels.blend, Groups::of(view.data.tile_count().into()), &resources)
+    }
+
+    fn blend_backward(&self, buffers: &Buffers, gradients: &GradientBuffers, view: &ViewBuffer) -> Dispatch {
+        let Buffers { footprints, intersections, images, .. } = buffers;
+        let resources = [
+            (0, whole(&view.buffer)),
+            (2, whole(&images.bounds)),
+            (3, whole(sorted_slots(intersections, &view.data))),
+            (4, whole(&intersections.owners)),
+            (5, whole(&footprints.footprints)),
+            (6, whole(&images.rendered)),
+            (7, whole(&images.last)),
+            (8, whole(&gradients.image)),
+            (9, whole(&intersections.sums)),
+        ];
+        self.dispatch(&self.kernels.blend_backward, Groups::of(view.data.tile_count().into()), &resources)
+    }
+
+    fn project_backward(
+        &self,
+        buffers: &Buffers,
+        gradients: &GradientBuffers,
+        view: &ViewBuffer,
+    ) -> Dispatch {
+        let Buffers { common, parameters, footprints, intersections, .. } = buffers;
+        let resources = [
+            (0, whole(&view.buffer)),
+            (1, whole(&common.step)),
+            (2, whole(&common.state)),
+            (3, whole(&parameters.geometry)),
+            (4, whole(&parameters.sh)),
+            (5, whole(&footprints.ranges)),
+            (6, whole(&intersections.sums)),
+            (7, whole(&gradients.geometry)),
+            (8, whole(&gradients.sh)),
+            (9, whole(&gradients.density)),
+        ];
+        self.dispatch(&self.kernels.project_backward, Groups::threads(footprints.count), &resources)
     }
 }
 

@@ -10,11 +10,13 @@ mod support;
 use splat::engine::Engine;
 use splat_shaders::GpuEngine;
 use support::engine;
-use trackersplat_tests::golden::{Golden, largest_difference};
+use trackersplat_tests::golden::{Golden, largest_difference, relative_norm};
 
 const SCENES: [&str; 7] = ["basic", "degree0", "needles", "opaque", "near", "faint", "unnormalised"];
 
 const IMAGE_TOLERANCE: f64 = 2e-5;
+
+const GRADIENT_TOLERANCE: f64 = 1e-4;
 
 fn for_each_golden(check: impl Fn(&str, &Golden, &GpuEngine)) {
     let Some(engine) = engine() else { return };
@@ -43,5 +45,34 @@ fn images_match_the_dense_reference() {
         println!("{name}: image {image:.1e}, alpha {alpha:.1e}");
         assert!(image < IMAGE_TOLERANCE, "{name}: image differs by {image:e}");
         assert!(alpha < IMAGE_TOLERANCE, "{name}: alpha differs by {alpha:e}");
+    });
+}
+
+#[test]
+fn gradients_match_automatic_differentiation() {
+    for_each_golden(|name, golden, engine| {
+        let image_seed: Vec<f32> = golden.values("seed_image").iter().map(|&value| value as f32).collect();
+        let alpha_seed: Vec<f32> = golden.values("seed_alpha").iter().map(|&value| value as f32).collect();
+        let gradients = engine
+            .render_backward(
+                &golden.gaussians(),
+                &golden.camera(),
+                background(golden),
+                &image_seed,
+                &alpha_seed,
+            )
+            .unwrap();
+        let arrays: [(&str, Vec<f32>); 5] = [
+            ("mean", gradients.means.into_flattened()),
+            ("rotation", gradients.rotations.into_flattened()),
+            ("log_scale", gradients.log_scales.into_flattened()),
+            ("logit_opacity", gradients.logit_opacities),
+            ("sh", gradients.sh),
+        ];
+        for (array, ours) in arrays {
+            let error = relative_norm(wide(&ours), golden.values(&format!("grad_{array}")));
+            println!("{name}: {array} {error:.1e}");
+            assert!(error < GRADIENT_TOLERANCE, "{name}: gradient by {array} off by {error:e}");
+        }
     });
 }

@@ -42,17 +42,42 @@ fn to_camera(offset: vec3<f32>, view: View) -> vec3<f32> {
     return vec3(dot(view.right.xyz, offset), dot(view.down.xyz, offset), dot(view.forward.xyz, offset));
 }
 
+fn largest_of(stored: vec4<f32>) -> f32 {
+    let magnitude = abs(stored);
+    return max(max(magnitude.x, magnitude.y), max(magnitude.z, magnitude.w));
+}
+
 // w, x, y, z of norm 1; the identity where the stored one has no direction.
 fn unit_rotation(stored: vec4<f32>) -> vec4<f32> {
-    let magnitude = abs(stored);
-    let largest = max(max(magnitude.x, magnitude.y), max(magnitude.z, magnitude.w));
+    let largest = largest_of(stored);
     if !(largest > 0.0 && largest < 3e38) {
         return vec4(1.0, 0.0, 0.0, 0.0);
     }
-    // Twice, as the inverse of a subnormal number overflows.
-    let doubled = select(stored, stored * 1e30, largest < 1e-30);
-    let scaled = doubled / select(largest, largest * 1e30, largest < 1e-30);
+    // By the largest component first: squares of the stored ones may vanish or overflow.
+    let scaled = stored / largest;
     return scaled / sqrt(dot(scaled, scaled));
+}
+
+// Gradient by the stored quaternion, from that by the rotation matrix.
+fn rotation_gradient(stored: vec4<f32>, g: mat3x3<f32>) -> vec4<f32> {
+    let unit = unit_rotation(stored);
+    let w = unit.x;
+    let x = unit.y;
+    let y = unit.z;
+    let z = unit.w;
+    // g[c][r] is the gradient by entry (r, c).
+    let by_unit = vec4(
+        2.0 * (z * (g[0].y - g[1].x) + y * (g[2].x - g[0].z) + x * (g[1].z - g[2].y)),
+        2.0 * (y * (g[1].x + g[0].y) + z * (g[2].x + g[0].z) + w * (g[1].z - g[2].y)) - 4.0 * x * (g[1].y + g[2].z),
+        2.0 * (x * (g[1].x + g[0].y) + z * (g[2].y + g[1].z) + w * (g[2].x - g[0].z)) - 4.0 * y * (g[0].x + g[2].z),
+        2.0 * (x * (g[2].x + g[0].z) + y * (g[2].y + g[1].z) + w * (g[0].y - g[1].x)) - 4.0 * z * (g[0].x + g[1].y),
+    );
+    let largest = largest_of(stored);
+    if !(largest > 0.0 && largest < 3e38) {
+        return vec4(0.0);
+    }
+    let scaled = stored / largest;
+    return (by_unit - unit * dot(unit, by_unit)) / sqrt(dot(scaled, scaled)) / largest;
 }
 
 fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
@@ -119,4 +144,17 @@ fn whitening(local: Projected) -> vec4<f32> {
     }
     let inverse = 1.0 / sqrt(variance_along_column(local));
     return vec4(-local.xy / local.xx * inverse, inverse, 1.0 / sqrt(local.xx), 0.0);
+}
+
+// The rows of `L` times the spread. Of the first one, the difference `across - slope · along` is written by the vector
+// triple product, which does not cancel for needles.
+fn whitened_spread(local: Projected) -> mat2x3<f32> {
+    if local.xx <= local.yy {
+        let along_row = LOW_PASS * local.across + cross(local.along, local.crossed);
+        let scale = 1.0 / (local.yy * sqrt(variance_along_row(local)));
+        return mat2x3(along_row * scale, local.along / sqrt(local.yy));
+    }
+    let along_column = LOW_PASS * local.along + cross(local.crossed, local.across);
+    let scale = 1.0 / (local.xx * sqrt(variance_along_column(local)));
+    return mat2x3(along_column * scale, local.across / sqrt(local.xx));
 }
