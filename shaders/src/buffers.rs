@@ -288,6 +288,59 @@ impl GradientBuffers {
     }
 }
 
+/// What the optimiser keeps per parameter, and which Gaussians it leaves alone.
+#[derive(Clone, Debug)]
+pub(crate) struct OptimiserBuffers {
+    /// First and second moments of the geometry, then of the spherical harmonics.
+    pub moments: [Buffer; 4],
+    pub active: Buffer,
+}
+
+impl OptimiserBuffers {
+    /// Zero moments; `active` is empty if all are.
+    pub(crate) fn new(
+        device: &GpuDevice,
+        count: u64,
+        coefficients: u64,
+        active: &[bool],
+    ) -> Result<Self, EngineError> {
+        let (geometry, sh) = (4 * GEOMETRY as u64 * count, 12 * coefficients * count);
+        let requests = [
+            storage("first moments of the geometry", geometry),
+            storage("second moments of the geometry", geometry),
+            storage("first moments of sh", sh),
+            storage("second moments of sh", sh),
+            storage("active", 4 * active.len() as u64),
+        ];
+        let [a, b, c, d, flags] = allocate(device, requests)?;
+        let values: Vec<u32> = active.iter().map(|&active| u32::from(active)).collect();
+        device.queue.write_buffer(&flags, 0, bytemuck::cast_slice(&values));
+        Ok(Self { moments: [a, b, c, d], active: flags })
+    }
+}
+
+/// What the loss of a view needs; the images' gradient is among the [`GradientBuffers`].
+#[derive(Clone, Debug)]
+pub(crate) struct LossBuffers {
+    pub derivatives: Buffer,
+    pub shares: Buffer,
+    /// Of the last steps.
+    pub losses: Buffer,
+}
+
+impl LossBuffers {
+    /// For images of so many pixels and tiles, and so many steps.
+    pub(crate) fn new(device: &GpuDevice, pixels: u64, tiles: u64, steps: u64) -> Result<Self, EngineError> {
+        let requests = [
+            storage("derivatives of SSIM", 36 * pixels),
+            storage("shares of the loss", 8 * tiles),
+            storage("losses", 4 * steps),
+        ];
+        let [derivatives, shares, losses] = allocate(device, requests)?;
+        Ok(Self { derivatives, shares, losses })
+    }
+}
+
 /// Everything that a view is drawn and differentiated with.
 #[derive(Clone, Debug)]
 pub(crate) struct Buffers {

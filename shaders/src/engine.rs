@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytemuck::bytes_of;
 use splat::{
     cameras::Camera,
-    engine::{Engine, EngineError, Rendering, Session, SessionInput},
+    engine::{Engine, EngineError, Rendering, Session, SessionInput, check_size},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     motion::moments::FootprintMoments,
@@ -22,6 +22,7 @@ use crate::{
     layout::{GEOMETRY, State, Step, View},
     program::record,
     readback::read,
+    session::GpuSession,
     stages::{Binder, ViewBuffer},
 };
 
@@ -61,7 +62,7 @@ impl GpuEngine {
         image_gradient: &[f32],
         alpha_gradient: &[f32],
     ) -> Result<GaussianGradients, EngineError> {
-        camera_has_pixels(camera)?;
+        check_size(camera)?;
         let Context { device, kernels } = &*self.context;
         let view = ViewBuffer::new(device, View::new(camera, background))?;
         let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
@@ -148,7 +149,7 @@ impl Engine for GpuEngine {
         camera: &Camera,
         background: [f32; 3],
     ) -> Result<Rendering, EngineError> {
-        camera_has_pixels(camera)?;
+        check_size(camera)?;
         let view = ViewBuffer::new(&self.context.device, View::new(camera, background))?;
         let buffers = self.buffers(gaussians, &view.data, false)?;
         let buffers = self.draw(gaussians, &view, buffers)?;
@@ -173,16 +174,7 @@ impl Engine for GpuEngine {
         ))
     }
 
-    fn session(&self, _input: SessionInput) -> Result<Box<dyn Session>, EngineError> {
-        Err(EngineError::InvalidInput("the GPU engine has no sessions".to_owned()))
+    fn session(&self, input: SessionInput) -> Result<Box<dyn Session>, EngineError> {
+        Ok(Box::new(GpuSession::new(Arc::clone(&self.context), input)?))
     }
-}
-
-/// An image without pixels has no tiles to dispatch.
-fn camera_has_pixels(camera: &Camera) -> Result<(), EngineError> {
-    if camera.width == 0 || camera.height == 0 {
-        let (width, height) = (camera.width, camera.height);
-        return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
-    }
-    Ok(())
 }

@@ -24,6 +24,9 @@ pub(crate) const SOURCES: &[(&str, &str)] = &[
     ("blend", composed!("blend")),
     ("blend_backward", composed!("blend_backward")),
     ("project_backward", composed!("project_backward")),
+    ("loss", composed!("loss")),
+    ("adam", composed!("adam")),
+    ("replace", composed!("replace")),
 ];
 
 /// An entry point of a stage.
@@ -93,6 +96,9 @@ kernels! {
     "blend": blend;
     "blend_backward": blend_backward;
     "project_backward": project_backward;
+    "loss": similarity, loss_gradient, total;
+    "adam": adam_geometry, adam_sh;
+    "replace": replace;
 }
 
 fn compile(device: &Device, name: &'static str) -> ShaderModule {

@@ -78,6 +78,22 @@ pub(crate) struct ScanSettings {
     pub list: u32,
 }
 
+/// A change of the set.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub(crate) struct ReplaceSettings {
+    pub count: u32,
+    pub width: u32,
+}
+
+/// What densification decides by, per Gaussian.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub(crate) struct Density {
+    pub gradient_norm: f32,
+    pub visible_steps: u32,
+}
+
 impl View {
     /// Without weights of a loss.
     pub(crate) fn new(camera: &Camera, background: [f32; 3]) -> Self {

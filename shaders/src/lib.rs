@@ -13,8 +13,10 @@ mod device;
 mod engine;
 mod kernels;
 mod layout;
+mod optimise;
 mod program;
 mod readback;
+mod session;
 mod stages;
 
 pub use device::{DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, devices};

@@ -9,7 +9,7 @@ use thiserror::Error;
 
 use crate::{
     cameras::Camera,
-    gaussians::Gaussians,
+    gaussians::{Gaussians, validate::validate},
     image::{Image, Mask},
     motion::moments::FootprintMoments,
     optim::LearningRates,
@@ -70,6 +70,51 @@ pub struct SessionInput {
     pub dssim_weight: f32,
     /// Gaussians that stay as they are, in every parameter; empty means none.
     pub frozen: Vec<bool>,
+}
+
+impl SessionInput {
+    /// Whether everything fits together; every engine's session starts with this.
+    pub fn validate(&self) -> Result<(), EngineError> {
+        if self.views.is_empty() {
+            return Err(EngineError::InvalidInput("no training view; give at least one".into()));
+        }
+        validate(&self.gaussians).map_err(|error| EngineError::InvalidInput(error.to_string()))?;
+        let count = self.gaussians.len();
+        if !(self.frozen.is_empty() || self.frozen.len() == count) {
+            return Err(EngineError::InvalidInput(format!(
+                "{} frozen flags for {count} Gaussians",
+                self.frozen.len()
+            )));
+        }
+        for (number, view) in self.views.iter().enumerate() {
+            let (image, camera) = (&view.image, &view.camera);
+            check_size(camera)?;
+            if (image.width, image.height) != (camera.width, camera.height) {
+                return Err(EngineError::InvalidInput(format!(
+                    "training image {number} is {}x{}, its camera {}x{}",
+                    image.width, image.height, camera.width, camera.height
+                )));
+            }
+            if let Some(mask) = &view.mask
+                && (mask.width, mask.height) != (camera.width, camera.height)
+            {
+                return Err(EngineError::InvalidInput(format!(
+                    "training mask {number} is {}x{}, its camera {}x{}",
+                    mask.width, mask.height, camera.width, camera.height
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// An image without pixels has nothing to hand out to the parts of a device.
+pub fn check_size(camera: &Camera) -> Result<(), EngineError> {
+    if camera.width == 0 || camera.height == 0 {
+        let (width, height) = (camera.width, camera.height);
+        return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
+    }
+    Ok(())
 }
 
 /// Statistics of one optimisation step.

@@ -7,6 +7,10 @@
 
 use std::sync::OnceLock;
 
+use glam::{DMat3, DVec3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use splat::{cameras::Camera, gaussians::Gaussians};
 use splat_shaders::{DeviceChoice, GpuDevice, GpuEngine, devices};
 
 /// The engine of this test program; `None` if the environment says that there is no device.
@@ -35,4 +39,45 @@ fn choice() -> Option<DeviceChoice> {
         Err(_) if GpuDevice::open(&DeviceChoice::Auto).is_ok() => Some(DeviceChoice::Auto),
         Err(_) => Some(DeviceChoice::Index(devices().first().map_or(0, |device| device.index))),
     }
+}
+
+/// Cameras on an arc of 60°, four units from the origin, looking at it.
+pub(crate) fn arc(count: usize, width: u32, height: u32) -> Vec<Camera> {
+    (0..count)
+        .map(|number| {
+            let angle = (number as f64 / (count.max(2) - 1) as f64 - 0.5) * std::f64::consts::FRAC_PI_3;
+            Camera {
+                width,
+                height,
+                fx: f64::from(width),
+                fy: f64::from(width),
+                cx: f64::from(width) / 2.0,
+                cy: f64::from(height) / 2.0,
+                rotation: DMat3::from_rotation_y(angle),
+                translation: DVec3::new(0.0, 0.0, 4.0),
+            }
+        })
+        .collect()
+}
+
+/// `count` opaque, coloured Gaussians about the origin, spherical harmonics of the given degree.
+pub(crate) fn blobs(count: usize, sh_degree: u32, seed: u64) -> Gaussians {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut draw = |low: f32, high: f32| random.random_range(low..high);
+    let mut gaussians = Gaussians::empty(sh_degree);
+    for _ in 0..count {
+        gaussians.means.push([draw(-1.0, 1.0), draw(-0.7, 0.7), draw(-0.7, 0.7)]);
+        gaussians.rotations.push([draw(-1.0, 1.0), draw(-1.0, 1.0), draw(-1.0, 1.0), draw(0.1, 1.0)]);
+        gaussians.log_scales.push([draw(-3.0, -1.5), draw(-3.0, -1.5), draw(-3.0, -1.5)]);
+        gaussians.logit_opacities.push(draw(0.0, 4.0));
+        for value in 0..3 * gaussians.sh_coefficients() {
+            gaussians.sh.push(if value < 3 { draw(-1.5, 1.5) } else { draw(-0.1, 0.1) });
+        }
+    }
+    gaussians
+}
+
+/// Numbers between -1 and 1.
+pub(crate) fn seeds(count: usize) -> Vec<f32> {
+    (0..count).map(|place| (place as f32 * 12.9898).sin()).collect()
 }

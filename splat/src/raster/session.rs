@@ -4,7 +4,7 @@ use super::pass::Pass;
 use crate::{
     cameras::Camera,
     engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
-    gaussians::{Gaussians, gradients::GaussianGradients, validate::validate},
+    gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
     optim::{Adam, LearningRates},
@@ -36,7 +36,7 @@ pub(super) struct CpuSession {
 
 impl CpuSession {
     pub(super) fn new(input: SessionInput, instructions: Instructions) -> Result<Self, EngineError> {
-        check(&input)?;
+        input.validate()?;
         let count = input.gaussians.len();
         let views = input
             .views
@@ -142,46 +142,4 @@ impl Session for CpuSession {
 
 fn empty_statistics(count: usize) -> DensityStatistics {
     DensityStatistics { gradient_norm: vec![0.0; count], visible_steps: vec![0; count] }
-}
-
-/// An image without pixels has no rows to hand out.
-pub(super) fn check_size(camera: &Camera) -> Result<(), EngineError> {
-    if camera.width == 0 || camera.height == 0 {
-        let (width, height) = (camera.width, camera.height);
-        return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
-    }
-    Ok(())
-}
-
-fn check(input: &SessionInput) -> Result<(), EngineError> {
-    if input.views.is_empty() {
-        return Err(EngineError::InvalidInput("no training view; give at least one".into()));
-    }
-    validate(&input.gaussians).map_err(|error| EngineError::InvalidInput(error.to_string()))?;
-    let count = input.gaussians.len();
-    if !(input.frozen.is_empty() || input.frozen.len() == count) {
-        return Err(EngineError::InvalidInput(format!(
-            "{} frozen flags for {count} Gaussians",
-            input.frozen.len()
-        )));
-    }
-    for (number, view) in input.views.iter().enumerate() {
-        let (image, camera) = (&view.image, &view.camera);
-        check_size(camera)?;
-        if (image.width, image.height) != (camera.width, camera.height) {
-            return Err(EngineError::InvalidInput(format!(
-                "training image {number} is {}x{}, its camera {}x{}",
-                image.width, image.height, camera.width, camera.height
-            )));
-        }
-        if let Some(mask) = &view.mask
-            && (mask.width, mask.height) != (camera.width, camera.height)
-        {
-            return Err(EngineError::InvalidInput(format!(
-                "training mask {number} is {}x{}, its camera {}x{}",
-                mask.width, mask.height, camera.width, camera.height
-            )));
-        }
-    }
-    Ok(())
 }
