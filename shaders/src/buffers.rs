@@ -179,7 +179,7 @@ pub(crate) struct SortBuffers {
 }
 
 impl SortBuffers {
-    fn new(device: &GpuDevice, length: u64) -> Result<Self, EngineError> {
+    pub(crate) fn new(device: &GpuDevice, length: u64) -> Result<Self, EngineError> {
         let histogram = DIGITS * length.div_ceil(BLOCK);
         let requests = [
             storage("keys", 4 * length),

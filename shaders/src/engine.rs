@@ -36,7 +36,7 @@ pub(crate) struct Context {
 /// The GPU engine.
 #[derive(Clone, Debug)]
 pub struct GpuEngine {
-    context: Arc<Context>,
+    pub(crate) context: Arc<Context>,
 }
 
 impl GpuEngine {
@@ -89,7 +89,7 @@ impl GpuEngine {
     }
 
     /// Buffers for one view with room for what it probably needs.
-    fn buffers(
+    pub(crate) fn buffers(
         &self,
         gaussians: &Gaussians,
         view: &View,
@@ -108,7 +108,7 @@ impl GpuEngine {
     }
 
     /// Stages 1 to 3, with more room until there is enough.
-    fn draw(
+    pub(crate) fn draw(
         &self,
         gaussians: &Gaussians,
         view: &ViewBuffer,

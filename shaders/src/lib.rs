@@ -8,6 +8,10 @@
 //! Every sum has a fixed order, so the same input gives the same bytes on the same device. Kernels ask for nothing beyond
 //! WebGPU's default limits and assume no subgroup size.
 
+// Tests of the crate and of its public side share their support.
+#[cfg(test)]
+extern crate self as splat_shaders;
+
 mod buffers;
 mod device;
 mod engine;
@@ -18,6 +22,8 @@ mod program;
 mod readback;
 mod session;
 mod stages;
+#[cfg(test)]
+mod tests;
 
 pub use device::{DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, devices};
 pub use engine::GpuEngine;

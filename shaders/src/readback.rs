@@ -1,5 +1,7 @@
 //! Bringing values back to the host.
 
+use std::{sync::mpsc::RecvTimeoutError, time::Duration};
+
 use bytemuck::Pod;
 use splat::engine::EngineError;
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, MapMode, PollType};
@@ -31,9 +33,16 @@ pub(crate) fn read<T: Pod>(
         // Nobody listens only where the reading was given up.
         let _ = sender.send(result);
     });
-    device.device.poll(PollType::wait_indefinitely()).map_err(|error| lost(error.to_string()))?;
-    device.check()?;
-    receiver.try_recv().map_err(|error| lost(error.to_string()))?.map_err(|error| lost(error.to_string()))?;
+    // Another thread's poll may have taken the callback up and not yet called it when ours returns.
+    let outcome = loop {
+        device.device.poll(PollType::wait_indefinitely()).map_err(|error| lost(error.to_string()))?;
+        device.check()?;
+        match receiver.recv_timeout(Duration::from_millis(10)) {
+            Err(RecvTimeoutError::Timeout) => continue,
+            other => break other,
+        }
+    };
+    outcome.map_err(|error| lost(error.to_string()))?.map_err(|error| lost(error.to_string()))?;
     let mapped = staging.get_mapped_range(..).map_err(|error| lost(error.to_string()))?;
     // Mapped memory has no alignment to promise.
     Ok(mapped.chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned).collect())

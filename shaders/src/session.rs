@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use bytemuck::bytes_of;
 use splat::{
-    engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport, TrainingView},
+    engine::{DensityStatistics, EngineError, Session, SessionInput, TrainingView},
     gaussians::Gaussians,
     optim::LearningRates,
 };
@@ -232,7 +232,7 @@ fn session_view(
 }
 
 impl Session for GpuSession {
-    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<StepReport, EngineError> {
+    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<(), EngineError> {
         if view >= self.views.len() {
             return Err(EngineError::InvalidInput(format!("view {view} of {}", self.views.len())));
         }
@@ -243,11 +243,16 @@ impl Session for GpuSession {
         let step = Submitted { view, rates: *rates, number: self.steps };
         self.submit(&step, self.submitted.len());
         self.submitted.push(step);
-        self.settle()?;
-        Ok(StepReport { loss: self.losses.drain(..).next_back().unwrap_or(0.0) })
+        Ok(())
     }
 
-    fn gaussians(&self) -> Result<Gaussians, EngineError> {
+    fn take_losses(&mut self) -> Result<Vec<f32>, EngineError> {
+        self.settle()?;
+        Ok(std::mem::take(&mut self.losses))
+    }
+
+    fn gaussians(&mut self) -> Result<Gaussians, EngineError> {
+        self.settle()?;
         let device = &self.context.device;
         let geometry: Vec<[f32; GEOMETRY]> = read(device, &self.buffers.parameters.geometry, self.count)?;
         let sh = read(device, &self.buffers.parameters.sh, 3 * self.coefficients() * self.count)?;

@@ -149,7 +149,7 @@ impl Binder<'_> {
     }
 
     /// Sorts by the lowest `4 · passes` bits and says where the result is.
-    fn sort<'b>(
+    pub(crate) fn sort<'b>(
         &self,
         common: &CommonBuffers,
         buffers: &'b SortBuffers,
@@ -184,7 +184,7 @@ impl Binder<'_> {
         (&buffers.keys[at], &buffers.values[at])
     }
 
-    fn scan(
+    pub(crate) fn scan(
         &self,
         common: &CommonBuffers,
         list: u32,
@@ -261,7 +261,7 @@ pub(crate) fn whole(buffer: &Buffer) -> BindingResource<'_> {
 }
 
 /// Passes of the sort by tile. One key more than there are tiles: that of no tile.
-fn tile_passes(view: &View) -> u32 {
+pub(crate) fn tile_passes(view: &View) -> u32 {
     (u32::BITS - view.tile_count().leading_zeros()).div_ceil(4)
 }
 

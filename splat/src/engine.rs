@@ -117,13 +117,6 @@ pub fn check_size(camera: &Camera) -> Result<(), EngineError> {
     Ok(())
 }
 
-/// Statistics of one optimisation step.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct StepReport {
-    /// The loss before the update.
-    pub loss: f32,
-}
-
 /// Per-Gaussian statistics that densification decides by, summed since they were last taken.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DensityStatistics {
@@ -136,11 +129,15 @@ pub struct DensityStatistics {
 
 /// Parameters, optimiser state and images kept on a device between steps.
 pub trait Session: Send {
-    /// One optimisation step on view `view` of the session's input.
-    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<StepReport, EngineError>;
+    /// One optimisation step on view `view` of the session's input. A device may still be at work on it afterwards: nothing
+    /// waits for it but the methods that read something back.
+    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<(), EngineError>;
+
+    /// Reads back the losses, each before its update, of the steps since this was last asked, oldest first.
+    fn take_losses(&mut self) -> Result<Vec<f32>, EngineError>;
 
     /// Reads the parameters back.
-    fn gaussians(&self) -> Result<Gaussians, EngineError>;
+    fn gaussians(&mut self) -> Result<Gaussians, EngineError>;
 
     /// Reads the densification statistics back and resets them.
     fn take_density_statistics(&mut self) -> Result<DensityStatistics, EngineError>;

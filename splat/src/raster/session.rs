@@ -3,7 +3,7 @@
 use super::pass::Pass;
 use crate::{
     cameras::Camera,
-    engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
+    engine::{DensityStatistics, EngineError, Session, SessionInput},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
@@ -32,6 +32,8 @@ pub(super) struct CpuSession {
     gradients: GaussianGradients,
     adam: Adam,
     density: DensityStatistics,
+    /// Of the steps since they were last taken.
+    losses: Vec<f32>,
 }
 
 impl CpuSession {
@@ -59,6 +61,7 @@ impl CpuSession {
             rendered: Image::filled(0, 0, [0.0; 3]),
             image_gradient: Vec::new(),
             workspace: LossWorkspace::new(instructions),
+            losses: Vec::new(),
         })
     }
 
@@ -73,7 +76,7 @@ impl CpuSession {
 }
 
 impl Session for CpuSession {
-    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<StepReport, EngineError> {
+    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<(), EngineError> {
         if view >= self.views.len() {
             return Err(EngineError::InvalidInput(format!("view {view} of {}", self.views.len())));
         }
@@ -98,10 +101,15 @@ impl Session for CpuSession {
         }
         let active = (!self.active.is_empty()).then_some(self.active.as_slice());
         self.adam.step(&mut self.gaussians, &self.gradients, rates, active);
-        Ok(StepReport { loss: value })
+        self.losses.push(value);
+        Ok(())
     }
 
-    fn gaussians(&self) -> Result<Gaussians, EngineError> {
+    fn take_losses(&mut self) -> Result<Vec<f32>, EngineError> {
+        Ok(std::mem::take(&mut self.losses))
+    }
+
+    fn gaussians(&mut self) -> Result<Gaussians, EngineError> {
         Ok(self.gaussians.clone())
     }
 
