@@ -164,6 +164,7 @@ pub struct GpuDevice {
     pub(crate) queue: Queue,
     description: DeviceDescription,
     limits: Limits,
+    memory_limit: Option<u64>,
     fault: Arc<Mutex<Fault>>,
 }
 
@@ -209,7 +210,17 @@ impl GpuDevice {
             let mut fault = failed.lock().unwrap_or_else(PoisonError::into_inner);
             fault.error.get_or_insert(error.to_string());
         }));
-        Ok(Self { device, queue, description, limits, fault })
+        Ok(Self { device, queue, description, limits, memory_limit: None, fault })
+    }
+
+    /// Lets jobs take so many bytes at most; without it, jobs take what the driver grants, which it does not tell before.
+    pub fn with_memory_limit(self, bytes: u64) -> Self {
+        Self { memory_limit: Some(bytes), ..self }
+    }
+
+    /// See [`GpuDevice::with_memory_limit`].
+    pub(crate) fn memory_limit(&self) -> Option<u64> {
+        self.memory_limit
     }
 
     /// What it is.

@@ -13,10 +13,7 @@ use splat::{
 };
 
 use crate::{
-    buffers::{
-        Buffers, CommonBuffers, FootprintBuffers, GradientBuffers, ImageBuffers, IntersectionBuffers,
-        ParameterBuffers, first_capacity, separated,
-    },
+    buffers::{Buffers, GradientBuffers, Size, admit, first_capacity, separated},
     device::GpuDevice,
     kernels::Kernels,
     layout::{GEOMETRY, State, Step, View},
@@ -66,9 +63,7 @@ impl GpuEngine {
         let Context { device, kernels } = &*self.context;
         let view = ViewBuffer::new(device, View::new(camera, background))?;
         let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
-        let coefficients = gaussians.sh_coefficients();
-        let gradients =
-            GradientBuffers::new(device, gaussians.len() as u64, coefficients as u64, view.data.pixels())?;
+        let gradients = GradientBuffers::new(device, &buffers.size)?;
         let alpha = alpha_gradient.iter().copied().chain(std::iter::repeat(0.0));
         let pixels: Vec<f32> = image_gradient
             .as_chunks::<3>()
@@ -82,7 +77,7 @@ impl GpuEngine {
         record(&mut encoder, "gradient", &Binder { device, kernels }.backward(&buffers, &gradients, &view));
         device.queue.submit([encoder.finish()]);
         let geometry: Vec<[f32; GEOMETRY]> = read(device, &gradients.geometry, gaussians.len())?;
-        let sh = read(device, &gradients.sh, 3 * coefficients * gaussians.len())?;
+        let sh = read(device, &gradients.sh, gaussians.sh.len())?;
         let Gaussians { means, rotations, log_scales, logit_opacities, sh, .. } =
             separated(&geometry, sh, gaussians.sh_degree);
         Ok(GaussianGradients { means, rotations, log_scales, logit_opacities, sh })
@@ -96,15 +91,17 @@ impl GpuEngine {
         has_gradient: bool,
     ) -> Result<Buffers, EngineError> {
         let device = &self.context.device;
-        let count = gaussians.len() as u64;
-        Ok(Buffers {
-            common: CommonBuffers::new(device)?,
-            parameters: ParameterBuffers::new(device, gaussians)?,
-            footprints: FootprintBuffers::new(device, count)?,
-            intersections: IntersectionBuffers::new(device, first_capacity(count, view), has_gradient)?,
-            images: ImageBuffers::new(device, view.pixels(), view.tile_count().into())?,
+        let (count, tiles) = (gaussians.len() as u64, view.tile_count().into());
+        let size = Size {
+            count,
+            coefficients: gaussians.sh_coefficients() as u64,
+            pixels: view.pixels(),
+            tiles,
+            capacity: first_capacity(count, tiles),
             has_gradient,
-        })
+        };
+        admit(device, &Buffers::requests(&size))?;
+        Buffers::new(device, gaussians, &size)
     }
 
     /// Stages 1 to 3, with more room until there is enough.
@@ -120,7 +117,7 @@ impl GpuEngine {
                 count: gaussians.len() as u32,
                 coefficients: gaussians.sh_coefficients() as u32,
                 degree: gaussians.sh_degree,
-                capacity: buffers.intersections.capacity as u32,
+                capacity: buffers.size.capacity as u32,
                 ..Step::default()
             };
             let state = State { gaussians: step.count, ..State::default() };
@@ -133,7 +130,9 @@ impl GpuEngine {
             if state[0].failed == 0 {
                 return Ok(buffers);
             }
-            buffers.make_room(device, state[0].needed)?;
+            let size = buffers.size.with_room(device, state[0].needed)?;
+            admit(device, &Buffers::requests(&size))?;
+            buffers.resize(device, size)?;
         }
     }
 }

@@ -16,8 +16,8 @@ use wgpu::Buffer;
 
 use crate::{
     buffers::{
-        Buffers, CommonBuffers, FootprintBuffers, GradientBuffers, ImageBuffers, IntersectionBuffers,
-        LossBuffers, OptimiserBuffers, ParameterBuffers, allocate, first_capacity, separated, storage,
+        Buffers, FootprintBuffers, GradientBuffers, LossBuffers, OptimiserBuffers, ParameterBuffers, Request,
+        Size, admit, allocate, first_capacity, separated, storage, training_image, training_requests,
     },
     device::GpuDevice,
     engine::Context,
@@ -73,31 +73,27 @@ impl GpuSession {
         input.validate()?;
         let device = &context.device;
         let gaussians = &input.gaussians;
-        let (count, coefficients) = (gaussians.len() as u64, gaussians.sh_coefficients() as u64);
-        let views = input
-            .views
-            .iter()
-            .map(|view| session_view(device, view, &input))
-            .collect::<Result<Vec<_>, _>>()?;
-        let largest =
-            |size: &dyn Fn(&View) -> u64| views.iter().map(|view| size(&view.view.data)).max().unwrap_or(0);
-        let (pixels, tiles) = (largest(&View::pixels), largest(&|view| view.tile_count().into()));
-        let capacity = views.iter().map(|view| first_capacity(count, &view.view.data)).max().unwrap_or(0);
-        let buffers = Buffers {
-            common: CommonBuffers::new(device)?,
-            parameters: ParameterBuffers::new(device, gaussians)?,
-            footprints: FootprintBuffers::new(device, count)?,
-            intersections: IntersectionBuffers::new(device, capacity, true)?,
-            images: ImageBuffers::new(device, pixels, tiles)?,
+        let images = || input.views.iter().map(|view| View::new(&view.camera, input.background));
+        let (count, tiles) = (gaussians.len() as u64, images().map(|view| view.tile_count()).max());
+        let tiles = u64::from(tiles.unwrap_or(0));
+        let size = Size {
+            count,
+            coefficients: gaussians.sh_coefficients() as u64,
+            pixels: images().map(|view| view.pixels()).max().unwrap_or(0),
+            tiles,
+            capacity: first_capacity(count, tiles),
             has_gradient: true,
         };
         let active: Vec<bool> = input.frozen.iter().map(|frozen| !frozen).collect();
+        let pixels = images().map(|view| view.pixels());
+        admit(device, &training_requests(&size, pixels, active.len(), REMEMBERED))?;
+        let views = input.views.iter().map(|view| session_view(device, view, &input));
         let mut session = Self {
-            gradients: GradientBuffers::new(device, count, coefficients, pixels)?,
-            optimiser: OptimiserBuffers::new(device, count, coefficients, &active)?,
-            loss: LossBuffers::new(device, pixels, tiles, REMEMBERED as u64)?,
-            buffers,
-            views,
+            views: views.collect::<Result<_, _>>()?,
+            buffers: Buffers::new(device, gaussians, &size)?,
+            gradients: GradientBuffers::new(device, &size)?,
+            optimiser: OptimiserBuffers::new(device, &size, &active)?,
+            loss: LossBuffers::new(device, &size, REMEMBERED)?,
             active,
             count: gaussians.len(),
             sh_degree: gaussians.sh_degree,
@@ -108,6 +104,12 @@ impl GpuSession {
         };
         session.bind();
         Ok(session)
+    }
+
+    /// All buffers of a session of this size.
+    fn requests(&self, size: &Size, active: usize) -> Vec<Request> {
+        let pixels = self.views.iter().map(|view| view.view.data.pixels());
+        training_requests(size, pixels, active, REMEMBERED)
     }
 
     fn coefficients(&self) -> usize {
@@ -144,7 +146,7 @@ impl GpuSession {
             count: self.count as u32,
             coefficients: self.coefficients() as u32,
             degree: rates.sh_degree.min(self.sh_degree),
-            capacity: self.buffers.intersections.capacity as u32,
+            capacity: self.buffers.size.capacity as u32,
             rates: [rates.mean, rates.rotation, rates.log_scale, rates.logit_opacity],
             sh_rates: [rates.sh_dc, rates.sh_rest],
             first_correction: (1.0 / decay(BETA1)) as f32,
@@ -172,7 +174,9 @@ impl GpuSession {
             if failed == 0 {
                 break;
             }
-            self.buffers.make_room(&context.device, needed)?;
+            let size = self.buffers.size.with_room(&context.device, needed)?;
+            admit(&context.device, &self.requests(&size, self.active.len()))?;
+            self.buffers.resize(&context.device, size)?;
             self.bind();
             for (place, step) in self.submitted.iter().enumerate() {
                 self.submit(step, place);
@@ -182,10 +186,15 @@ impl GpuSession {
     }
 
     /// Moments of a set that takes those of the Gaussians in `source` over.
-    fn moments_of(&self, source: &[Option<usize>], active: &[bool]) -> Result<OptimiserBuffers, EngineError> {
+    fn moments_of(
+        &self,
+        source: &[Option<usize>],
+        active: &[bool],
+        size: &Size,
+    ) -> Result<OptimiserBuffers, EngineError> {
         let Context { device, kernels } = &*self.context;
-        let count = source.len() as u64;
-        let taken = OptimiserBuffers::new(device, count, self.coefficients() as u64, active)?;
+        let count = size.count;
+        let taken = OptimiserBuffers::new(device, size, active)?;
         let [sources] = allocate(device, [storage("sources", 4 * count)])?;
         let numbers: Vec<u32> = source.iter().map(|old| old.map_or(u32::MAX, |old| old as u32)).collect();
         device.queue.write_buffer(&sources, 0, bytemuck::cast_slice(&numbers));
@@ -226,7 +235,7 @@ fn session_view(
         view.absolute = (1.0 - input.dssim_weight) / values;
         view.structural = input.dssim_weight / values;
     }
-    let [buffer] = allocate(device, [storage("training image", 16 * view.pixels())])?;
+    let [buffer] = allocate(device, [training_image(view.pixels())])?;
     device.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&wanted));
     Ok(SessionView { view: ViewBuffer::new(device, view)?, wanted: buffer, program: Vec::new() })
 }
@@ -280,14 +289,15 @@ impl Session for GpuSession {
         } else {
             source.iter().map(|old| old.is_none_or(|old| self.active[old])).collect()
         };
-        let optimiser = self.moments_of(source, &active)?;
         let context = Arc::clone(&self.context);
         let device = &context.device;
-        let (count, coefficients) = (gaussians.len() as u64, self.coefficients() as u64);
-        let pixels = self.views.iter().map(|view| view.view.data.pixels()).max().unwrap_or(0);
+        let size = Size { count: gaussians.len() as u64, ..self.buffers.size };
+        admit(device, &self.requests(&size, active.len()))?;
+        let optimiser = self.moments_of(source, &active, &size)?;
         self.buffers.parameters = ParameterBuffers::new(device, &gaussians)?;
-        self.buffers.footprints = FootprintBuffers::new(device, count)?;
-        self.gradients = GradientBuffers::new(device, count, coefficients, pixels)?;
+        self.buffers.footprints = FootprintBuffers::new(device, size.count)?;
+        self.buffers.size = size;
+        self.gradients = GradientBuffers::new(device, &size)?;
         self.optimiser = optimiser;
         self.active = active;
         self.count = gaussians.len();

@@ -13,7 +13,9 @@ use super::{
     support::{self, arc, blobs, seeds},
 };
 use crate::{
-    buffers::{GradientBuffers, LossBuffers, OptimiserBuffers, allocate, interleaved, separated, storage},
+    buffers::{
+        GradientBuffers, LossBuffers, OptimiserBuffers, allocate, parameters::interleaved, separated, storage,
+    },
     layout::{GEOMETRY, State, Step, View},
     readback::read,
     stages::{Binder, ViewBuffer},
@@ -56,8 +58,8 @@ fn the_loss_and_its_gradient_are_those_of_the_cpu_engine() {
         let view = ViewBuffer::new(device, data).unwrap();
         let gaussians = blobs(1, 0, 1);
         let buffers = engine.buffers(&gaussians, &data, true).unwrap();
-        let gradients = GradientBuffers::new(device, 1, 1, data.pixels()).unwrap();
-        let loss = LossBuffers::new(device, data.pixels(), data.tile_count().into(), 4).unwrap();
+        let gradients = GradientBuffers::new(device, &buffers.size).unwrap();
+        let loss = LossBuffers::new(device, &buffers.size, 4).unwrap();
         let [target] = allocate(device, [storage("wanted", 16 * data.pixels())]).unwrap();
         let four = |image: &Image, fourth: &dyn Fn(usize) -> f32| -> Vec<[f32; 4]> {
             let rgb = image.pixels.as_chunks::<3>().0.iter().enumerate();
@@ -106,8 +108,8 @@ fn descent_is_that_of_the_cpu_engine() {
     let active: Vec<bool> = (0..150).map(|index| index % 4 != 1).collect();
     let view = View::new(&arc(1, 8, 8)[0], [0.0; 3]);
     let buffers = engine.buffers(&start, &view, true).unwrap();
-    let gradients = GradientBuffers::new(device, 150, 9, 64).unwrap();
-    let optimiser = OptimiserBuffers::new(device, 150, 9, &active).unwrap();
+    let gradients = GradientBuffers::new(device, &buffers.size).unwrap();
+    let optimiser = OptimiserBuffers::new(device, &buffers.size, &active).unwrap();
     let state = State { gaussians: 150, ..State::default() };
     device.queue.write_buffer(&buffers.common.state, 0, bytes_of(&state));
     let (mut expected, mut adam) = (start.clone(), Adam::new(&start));

@@ -1,7 +1,9 @@
 //! Optimisation sessions of the GPU engine beside those of the CPU engine.
 use std::sync::Arc;
 
-use crate::support::{arc, blobs, engine};
+use splat_shaders::GpuEngine;
+
+use crate::support::{arc, blobs, engine, open};
 use splat::{
     engine::{Engine, EngineError, SessionInput, TrainingView},
     gaussians::Gaussians,
@@ -240,4 +242,30 @@ fn an_empty_set_takes_steps() {
     session.replace(Gaussians::empty(1), &[]).unwrap();
     session.step(2, &RATES).unwrap();
     assert!(session.take_density_statistics().unwrap().gradient_norm.is_empty());
+}
+
+#[test]
+fn what_does_not_fit_is_refused_with_figures() {
+    let Some(_) = engine() else { return };
+    // Parameters, optimiser state and gradients of 5000 Gaussians of degree 3 alone are 6 MB.
+    let limited = GpuEngine::new(open().with_memory_limit(6_000_000)).unwrap();
+    let truth = blobs(3, 3, 15);
+    match limited.session(input(blobs(5000, 3, 16), &truth)).err() {
+        Some(EngineError::OutOfResources { needed, available }) => {
+            assert!((6_000_000..20_000_000).contains(&needed), "{needed}");
+            assert_eq!(available, 6_000_000);
+        }
+        other => panic!("{other:?}"),
+    }
+    let mut session = limited.session(input(blobs(100, 3, 17), &truth)).unwrap();
+    session.step(0, &RATES).unwrap();
+    let refused = session.replace(blobs(5000, 3, 18), &vec![None; 5000]).err();
+    assert!(matches!(refused, Some(EngineError::OutOfResources { .. })), "{refused:?}");
+    session.step(1, &RATES).unwrap();
+    assert_eq!(session.take_losses().unwrap().len(), 2, "the session goes on with what it had");
+    // Intersections, not Gaussians, are too many: known only once the device has counted them.
+    let mut giants = blobs(300, 0, 19);
+    giants.log_scales.fill([3.0; 3]);
+    let refused = limited.render(&giants, &arc(1, 512, 512)[0], BLACK).err();
+    assert!(matches!(refused, Some(EngineError::OutOfResources { .. })), "{refused:?}");
 }

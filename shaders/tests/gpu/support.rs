@@ -17,16 +17,21 @@ use splat_shaders::{DeviceChoice, GpuDevice, GpuEngine, devices};
 pub(crate) fn engine() -> Option<&'static GpuEngine> {
     static ENGINE: OnceLock<Option<GpuEngine>> = OnceLock::new();
     let engine = ENGINE.get_or_init(|| {
-        let choice = choice()?;
-        let device = GpuDevice::open(&choice).unwrap_or_else(|error| {
-            panic!("{error}. Software Vulkan will do (Debian: mesa-vulkan-drivers); TRACKERSPLAT_TEST_DEVICE=none skips these tests")
-        });
-        Some(GpuEngine::new(device).expect("kernels compile on every device"))
+        choice()?;
+        Some(GpuEngine::new(open()).expect("kernels compile on every device"))
     });
     if engine.is_none() {
         eprintln!("skipped: TRACKERSPLAT_TEST_DEVICE=none");
     }
     engine.as_ref()
+}
+
+/// The device of this test program; the environment must not say that there is none.
+pub(crate) fn open() -> GpuDevice {
+    let choice = choice().expect("callers have asked for the engine first");
+    GpuDevice::open(&choice).unwrap_or_else(|error| {
+        panic!("{error}. Software Vulkan will do (Debian: mesa-vulkan-drivers); TRACKERSPLAT_TEST_DEVICE=none skips these tests")
+    })
 }
 
 fn choice() -> Option<DeviceChoice> {
