@@ -6,8 +6,8 @@ use wgpu::{BindingResource, Buffer};
 
 use crate::{
     buffers::{
-        BLOCK, Buffers, CommonBuffers, DEPTH_PASSES, GradientBuffers, IntersectionBuffers, SortBuffers,
-        allocate, uniform,
+        BLOCK, Buffers, CommonBuffers, DEPTH_PASSES, DIGITS, GradientBuffers, IntersectionBuffers,
+        SortBuffers, allocate, uniform,
     },
     device::GpuDevice,
     kernels::{Kernel, Kernels},
@@ -89,7 +89,7 @@ impl Binder<'_> {
     fn bin(&self, buffers: &Buffers, view: &ViewBuffer, program: &mut Vec<Dispatch>) {
         let Buffers { common, footprints, intersections, images, .. } = buffers;
         let blocks = Groups::of(footprints.count.div_ceil(BLOCK));
-        let scans = Groups::of((16 * footprints.count.div_ceil(BLOCK)).div_ceil(BLOCK));
+        let scans = Groups::of((DIGITS * footprints.count.div_ceil(BLOCK)).div_ceil(BLOCK));
         let (depths, order) = self.sort(common, &footprints.depth, 0, DEPTH_PASSES, &blocks, &scans, program);
         program.push(self.dispatch(
             &self.kernels.count,
@@ -148,7 +148,7 @@ impl Binder<'_> {
         ));
     }
 
-    /// Sorts by the lowest `4 · passes` bits and says where the result is.
+    /// Sorts by the lowest `8 · passes` bits and says where the result is.
     pub(crate) fn sort<'b>(
         &self,
         common: &CommonBuffers,
@@ -168,15 +168,16 @@ impl Binder<'_> {
                 (4, whole(&buffers.histogram)),
             ];
             program.push(self.dispatch(&self.kernels.histogram, blocks.clone(), &counted));
-            self.scan(common, list + 1, &buffers.histogram, &buffers.sums, scans, program);
+            self.scan_blocks(common, list + 1, &buffers.histogram, &buffers.sums, scans, program);
             let scattered = [
                 (0, common.sort_setting(list, pass)),
                 (1, whole(&common.state)),
                 (2, whole(&buffers.keys[from])),
                 (3, whole(&buffers.values[from])),
                 (4, whole(&buffers.histogram)),
-                (5, whole(&buffers.keys[to])),
-                (6, whole(&buffers.values[to])),
+                (5, whole(&buffers.sums)),
+                (6, whole(&buffers.keys[to])),
+                (7, whole(&buffers.values[to])),
             ];
             program.push(self.dispatch(&self.kernels.scatter, blocks.clone(), &scattered));
         }
@@ -193,12 +194,25 @@ impl Binder<'_> {
         groups: &Groups,
         program: &mut Vec<Dispatch>,
     ) {
-        let settings = || [(0, common.scan_setting(list)), (1, whole(&common.state))];
-        let all = [&settings()[..], &[(2, whole(values)), (3, whole(sums))]].concat();
-        let spine = [&settings()[..], &[(3, whole(sums))]].concat();
-        program.push(self.dispatch(&self.kernels.reduce, groups.clone(), &all));
+        self.scan_blocks(common, list, values, sums, groups, program);
+        let resources = scan_resources(common, list, values, sums);
+        program.push(self.dispatch(&self.kernels.add, groups.clone(), &resources));
+    }
+
+    /// Sums within blocks, and over the blocks before.
+    fn scan_blocks(
+        &self,
+        common: &CommonBuffers,
+        list: u32,
+        values: &Buffer,
+        sums: &Buffer,
+        groups: &Groups,
+        program: &mut Vec<Dispatch>,
+    ) {
+        let [settings, state, values, sums] = scan_resources(common, list, values, sums);
+        let spine = [settings.clone(), state.clone(), sums.clone()];
+        program.push(self.dispatch(&self.kernels.reduce, groups.clone(), &[settings, state, values, sums]));
         program.push(self.dispatch(&self.kernels.spine, Groups::of(1), &spine));
-        program.push(self.dispatch(&self.kernels.add, groups.clone(), &all));
     }
 
     fn blend(&self, buffers: &Buffers, view: &ViewBuffer) -> Dispatch {
@@ -255,6 +269,15 @@ impl Binder<'_> {
     }
 }
 
+fn scan_resources<'b>(
+    common: &'b CommonBuffers,
+    list: u32,
+    values: &'b Buffer,
+    sums: &'b Buffer,
+) -> [(u32, BindingResource<'b>); 4] {
+    [(0, common.scan_setting(list)), (1, whole(&common.state)), (2, whole(values)), (3, whole(sums))]
+}
+
 /// The whole buffer.
 pub(crate) fn whole(buffer: &Buffer) -> BindingResource<'_> {
     buffer.as_entire_binding()
@@ -262,7 +285,7 @@ pub(crate) fn whole(buffer: &Buffer) -> BindingResource<'_> {
 
 /// Passes of the sort by tile. One key more than there are tiles: that of no tile.
 pub(crate) fn tile_passes(view: &View) -> u32 {
-    (u32::BITS - view.tile_count().leading_zeros()).div_ceil(4)
+    (u32::BITS - view.tile_count().leading_zeros()).div_ceil(8)
 }
 
 /// Where the sort leaves the slots of a view.

@@ -111,7 +111,7 @@ fn plan() {
     // Blocks of the sort, and blocks of the scan of its histogram.
     let blocks = (planned + 1023u) / 1024u;
     dispatches[0] = in_rows(blocks);
-    dispatches[1] = in_rows((16u * blocks + 1023u) / 1024u);
+    dispatches[1] = in_rows((256u * blocks + 1023u) / 1024u);
 }
 
 // Per tile: first place in the sorted list, and one past the last.

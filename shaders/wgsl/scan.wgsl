@@ -1,4 +1,5 @@
-// Exclusive sums of a list, in place: blocks of 1024 by `reduce`, the blocks' sums by `spine`, both together by `add`.
+// Exclusive sums of a list, in place: within blocks of 1024 by `reduce`, over the blocks' sums by `spine`, both together by
+// `add`; the sort does without `add` and adds the two where it reads them.
 // Sums are saturated, so that a list too long for 32 bits is seen as too long.
 
 #import types::{State, group_number}
@@ -22,8 +23,8 @@ var<workgroup> partial: array<u32, THREADS>;
 fn length() -> u32 {
     switch settings.list {
         case 0u: { return state.gaussians + 1u; }
-        case 1u: { return 16u * ((state.gaussians + BLOCK - 1u) / BLOCK); }
-        default: { return 16u * ((state.intersections + BLOCK - 1u) / BLOCK); }
+        case 1u: { return 256u * ((state.gaussians + BLOCK - 1u) / BLOCK); }
+        default: { return 256u * ((state.intersections + BLOCK - 1u) / BLOCK); }
     }
 }
 

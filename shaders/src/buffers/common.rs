@@ -13,8 +13,8 @@ use crate::{
 /// Settings of a kernel start at multiples of this, the largest alignment that a device may ask for.
 const SETTING: u64 = 256;
 
-/// Passes of the sort by depth: all bits, four at a time.
-pub(crate) const DEPTH_PASSES: u32 = 8;
+/// Passes of the sort by depth: all bits, eight at a time.
+pub(crate) const DEPTH_PASSES: u32 = 4;
 
 /// What is there once: settings of the kernels, and what they know about the step.
 #[derive(Clone, Debug)]
@@ -34,17 +34,17 @@ impl CommonBuffers {
             uniform("step", size_of::<Step>() as u64),
             storage("state", size_of::<State>() as u64),
             indirect,
-            uniform("settings", SETTING * (2 * 8 + 3)),
+            uniform("settings", SETTING * u64::from(2 * DEPTH_PASSES + 3)),
         ];
         let [step, state, dispatches, settings] = allocate(device, requests)?;
         let common = Self { step, state, dispatches, settings };
         for list in 0..2 {
-            for pass in 0..8 {
-                common.set(device, 8 * list + pass, &SortSettings { list, shift: 4 * pass });
+            for pass in 0..DEPTH_PASSES {
+                common.set(device, DEPTH_PASSES * list + pass, &SortSettings { list, shift: 8 * pass });
             }
         }
         for list in 0..3 {
-            common.set(device, 16 + list, &ScanSettings { list });
+            common.set(device, 2 * DEPTH_PASSES + list, &ScanSettings { list });
         }
         Ok(common)
     }
@@ -63,11 +63,11 @@ impl CommonBuffers {
 
     /// Settings of pass `pass` of the sort of `list`.
     pub(crate) fn sort_setting(&self, list: u32, pass: u32) -> BindingResource<'_> {
-        self.setting::<SortSettings>(8 * list + pass)
+        self.setting::<SortSettings>(DEPTH_PASSES * list + pass)
     }
 
     /// Settings of the scan of `list`.
     pub(crate) fn scan_setting(&self, list: u32) -> BindingResource<'_> {
-        self.setting::<ScanSettings>(16 + list)
+        self.setting::<ScanSettings>(2 * DEPTH_PASSES + list)
     }
 }

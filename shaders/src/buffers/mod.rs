@@ -11,7 +11,7 @@ use wgpu::{Buffer, BufferDescriptor, BufferUsages, ErrorFilter};
 pub(crate) use self::{
     common::{CommonBuffers, DEPTH_PASSES},
     parameters::{ParameterBuffers, separated},
-    raster::{Buffers, FootprintBuffers, IntersectionBuffers, SortBuffers, first_capacity},
+    raster::{Buffers, DIGITS, FootprintBuffers, IntersectionBuffers, SortBuffers, first_capacity},
     training::{GradientBuffers, LossBuffers, OptimiserBuffers, training_image, training_requests},
 };
 use crate::device::GpuDevice;

@@ -7,7 +7,7 @@ use super::{BLOCK, CommonBuffers, ParameterBuffers, Request, Size, allocate, sto
 use crate::{device::GpuDevice, layout::SUMS};
 
 /// Digits of one pass of the sort.
-const DIGITS: u64 = 16;
+pub(crate) const DIGITS: u64 = 256;
 
 /// A sort's keys and values, twice, and its histogram.
 #[derive(Clone, Debug)]
