@@ -6,6 +6,7 @@
 )]
 
 mod layout;
+mod lost;
 mod optimisation;
 mod projection;
 mod sorting;

@@ -5,6 +5,7 @@
     reason = "tests; `--nocapture` shows the errors that were found"
 )]
 
+mod algorithms;
 mod golden;
 mod scenes;
 mod session;
