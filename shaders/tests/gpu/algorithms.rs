@@ -62,7 +62,7 @@ fn refinement_ends_where_that_of_the_cpu_engine_does() {
     println!("{} and {} steps, {our_psnr} and {their_psnr} dB", ours.steps, theirs.steps);
     assert_eq!(ours.steps, theirs.steps);
     assert!(
-        (ours.loss[1] - theirs.loss[1]).abs() < 0.01 * theirs.loss[1],
+        (ours.loss[1] - theirs.loss[1]).abs() < 0.05 * theirs.loss[1],
         "{:?} {:?}",
         ours.loss,
         theirs.loss
