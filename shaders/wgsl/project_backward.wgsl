@@ -38,20 +38,56 @@ struct GeometryGradient {
     projected_mean: vec2<f32>,
 }
 
-// Over the intersections in the order of their tiles.
-fn summed(range: vec2<u32>) -> FootprintGradient {
-    var total: FootprintGradient;
-    for (var slot = range.x; slot < range.x + range.y; slot++) {
+// More intersections than this are summed up by the whole workgroup.
+const MANY: u32 = 64u;
+
+// Gaussians of the workgroup that have many, in any order, and their number.
+var<workgroup> large: array<u32, THREADS>;
+var<workgroup> large_count: atomic<u32>;
+
+// What each thread has summed up: three vectors per thread.
+var<workgroup> parts: array<vec3<f32>, 768>;
+
+// Every `stride`-th intersection from `first` on, in the order of their tiles.
+fn summed(first: u32, end: u32, stride: u32) -> mat3x3<f32> {
+    var total: mat3x3<f32>;
+    for (var slot = first; slot < end; slot += stride) {
         let at = slot * SUMS;
-        total.v += sums[at];
-        total.first += vec2(sums[at + 1u], sums[at + 2u]);
-        total.second += vec3(sums[at + 3u], sums[at + 4u], sums[at + 5u]);
-        total.colour += vec3(sums[at + 6u], sums[at + 7u], sums[at + 8u]);
+        total[0] += vec3(sums[at], sums[at + 1u], sums[at + 2u]);
+        total[1] += vec3(sums[at + 3u], sums[at + 4u], sums[at + 5u]);
+        total[2] += vec3(sums[at + 6u], sums[at + 7u], sums[at + 8u]);
     }
-    // From base-2 exponents to whitened offsets proper.
-    total.first /= sqrt(0.5 * LOG2_E);
-    total.second /= 0.5 * LOG2_E;
     return total;
+}
+
+// The same by the whole workgroup, in an order that depends on the number of intersections only.
+fn summed_together(range: vec2<u32>, thread: u32) -> mat3x3<f32> {
+    let own = summed(range.x + thread, range.x + range.y, THREADS);
+    for (var k = 0u; k < 3u; k++) {
+        parts[k * THREADS + thread] = own[k];
+    }
+    workgroupBarrier();
+    for (var stride = THREADS / 2u; stride > 0u; stride /= 2u) {
+        if thread < stride {
+            for (var k = 0u; k < 3u; k++) {
+                parts[k * THREADS + thread] += parts[k * THREADS + thread + stride];
+            }
+        }
+        workgroupBarrier();
+    }
+    let total = mat3x3(parts[0], parts[THREADS], parts[2u * THREADS]);
+    workgroupBarrier();
+    return total;
+}
+
+// From base-2 exponents to whitened offsets proper.
+fn footprint_gradient(total: mat3x3<f32>) -> FootprintGradient {
+    return FootprintGradient(
+        total[0].x,
+        total[0].yz / sqrt(0.5 * LOG2_E),
+        total[1] / (0.5 * LOG2_E),
+        total[2],
+    );
 }
 
 // By the mean in camera axes, through the projected mean and through the Jacobian's entries.
@@ -149,15 +185,40 @@ fn project_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let index = group_number(group, groups) * THREADS + thread;
-    if index >= step.count || state.failed != 0u {
+    let first_index = group_number(group, groups) * THREADS;
+    if first_index >= step.count || state.failed != 0u {
         return;
     }
-    let range = ranges[index];
+    let index = first_index + thread;
+    var range = vec2(UNSEEN, 0u);
+    if index < step.count {
+        range = ranges[index];
+    }
+    if thread == 0u {
+        atomicStore(&large_count, 0u);
+    }
+    workgroupBarrier();
+    var total: mat3x3<f32>;
+    if range.y > MANY {
+        large[atomicAdd(&large_count, 1u)] = thread;
+    } else {
+        total = summed(range.x, range.x + range.y, 1u);
+    }
+    let together = workgroupUniformLoad(&large_count);
+    for (var i = 0u; i < together; i++) {
+        let owner = large[i];
+        let found = summed_together(ranges[first_index + owner], thread);
+        if thread == owner {
+            total = found;
+        }
+    }
+    if index >= step.count {
+        return;
+    }
     var gradient: GeometryGradient;
     var is_wanted = range.y > 0u;
     if is_wanted {
-        let footprint = summed(range);
+        let footprint = footprint_gradient(total);
         gradient = geometry_backward(index, footprint);
         is_wanted = is_sound(gradient, footprint.colour);
     }
