@@ -9,7 +9,7 @@ use thiserror::Error;
 
 use crate::{
     cameras::Camera,
-    gaussians::Gaussians,
+    gaussians::{Gaussians, validate::validate},
     image::{Image, Mask},
     motion::{moments::FootprintMoments, reweighting::Reweighting},
     optim::LearningRates,
@@ -72,11 +72,49 @@ pub struct SessionInput {
     pub frozen: Vec<bool>,
 }
 
-/// Statistics of one optimisation step.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct StepReport {
-    /// The loss before the update.
-    pub loss: f32,
+impl SessionInput {
+    /// Whether everything fits together; every engine's session starts with this.
+    pub fn validate(&self) -> Result<(), EngineError> {
+        if self.views.is_empty() {
+            return Err(EngineError::InvalidInput("no training view; give at least one".into()));
+        }
+        validate(&self.gaussians).map_err(|error| EngineError::InvalidInput(error.to_string()))?;
+        let count = self.gaussians.len();
+        if !(self.frozen.is_empty() || self.frozen.len() == count) {
+            return Err(EngineError::InvalidInput(format!(
+                "{} frozen flags for {count} Gaussians",
+                self.frozen.len()
+            )));
+        }
+        for (number, view) in self.views.iter().enumerate() {
+            let (image, camera) = (&view.image, &view.camera);
+            check_size(camera)?;
+            if (image.width, image.height) != (camera.width, camera.height) {
+                return Err(EngineError::InvalidInput(format!(
+                    "training image {number} is {}x{}, its camera {}x{}",
+                    image.width, image.height, camera.width, camera.height
+                )));
+            }
+            if let Some(mask) = &view.mask
+                && (mask.width, mask.height) != (camera.width, camera.height)
+            {
+                return Err(EngineError::InvalidInput(format!(
+                    "training mask {number} is {}x{}, its camera {}x{}",
+                    mask.width, mask.height, camera.width, camera.height
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// An image without pixels has nothing to hand out to the parts of a device.
+pub fn check_size(camera: &Camera) -> Result<(), EngineError> {
+    if camera.width == 0 || camera.height == 0 {
+        let (width, height) = (camera.width, camera.height);
+        return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
+    }
+    Ok(())
 }
 
 /// Per-Gaussian statistics that densification decides by, summed since they were last taken.
@@ -91,11 +129,15 @@ pub struct DensityStatistics {
 
 /// Parameters, optimiser state and images kept on a device between steps.
 pub trait Session: Send {
-    /// One optimisation step on view `view` of the session's input.
-    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<StepReport, EngineError>;
+    /// One optimisation step on view `view` of the session's input. A device may still be at work on it afterwards: nothing
+    /// waits for it but the methods that read something back.
+    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<(), EngineError>;
+
+    /// Reads back the losses, each before its update, of the steps since this was last asked, oldest first.
+    fn take_losses(&mut self) -> Result<Vec<f32>, EngineError>;
 
     /// Reads the parameters back.
-    fn gaussians(&self) -> Result<Gaussians, EngineError>;
+    fn gaussians(&mut self) -> Result<Gaussians, EngineError>;
 
     /// Reads the densification statistics back and resets them.
     fn take_density_statistics(&mut self) -> Result<DensityStatistics, EngineError>;

@@ -48,8 +48,8 @@ fn optimised(gaussians: &Gaussians, target: f32, instructions: Instructions) -> 
         frozen: Vec::new(),
     };
     let mut session = CpuEngine::new(instructions).session(input).unwrap();
-    let losses = (0..STEPS).map(|_| session.step(0, &RATES).unwrap().loss).collect();
-    (session.gaussians().unwrap(), losses)
+    (0..STEPS).for_each(|_| session.step(0, &RATES).unwrap());
+    (session.gaussians().unwrap(), session.take_losses().unwrap())
 }
 
 /// Parameters with the rate of each.

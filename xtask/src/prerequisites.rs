@@ -7,10 +7,12 @@ use std::{
 
 use anyhow::{Result, bail};
 
-/// A program outside of the repository.
+/// A program or driver outside of the repository.
 struct Tool {
     /// Programs of which one is enough.
     programs: &'static [&'static str],
+    /// Folders of which one that is not empty is enough.
+    folders: &'static [&'static str],
     /// Packages on Debian and Ubuntu that bring one.
     packages: &'static [&'static str],
     /// What it is for.
@@ -19,17 +21,26 @@ struct Tool {
     is_required: bool,
 }
 
-const TOOLS: [Tool; 2] = [
+const TOOLS: [Tool; 3] = [
     Tool {
         programs: &["cc", "gcc", "clang"],
+        folders: &[],
         packages: &["gcc", "libc6-dev"],
         purpose: "a C compiler and linker, for the bundled SQLite and zstd",
         is_required: true,
     },
     Tool {
         programs: &["ffmpeg"],
+        folders: &[],
         packages: &["ffmpeg"],
         purpose: "ffmpeg, for the tests of clips with videos; they are skipped without it",
+        is_required: false,
+    },
+    Tool {
+        programs: &[],
+        folders: &["/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d"],
+        packages: &["libvulkan1", "mesa-vulkan-drivers"],
+        purpose: "a Vulkan driver, for the tests of the GPU engine; TRACKERSPLAT_TEST_DEVICE=none skips them",
         is_required: false,
     },
 ];
@@ -53,6 +64,12 @@ pub(crate) fn provide() -> Result<()> {
 
 impl Tool {
     fn is_there(&self) -> bool {
+        let is_filled =
+            |folder: &&str| Path::new(folder).read_dir().is_ok_and(|mut entries| entries.next().is_some());
+        // Drivers of other systems come with them.
+        if !self.folders.is_empty() && (!cfg!(target_os = "linux") || self.folders.iter().any(is_filled)) {
+            return true;
+        }
         let folders = std::env::var_os("PATH").unwrap_or_default();
         let is_in = |folder: &Path| self.programs.iter().any(|program| folder.join(program).is_file());
         std::env::split_paths(&folders).any(|folder| is_in(&folder))

@@ -64,7 +64,7 @@ fn times(scene: &Scene, repeat: usize) -> Result<Times> {
     let mut times: Times = Default::default();
     for number in 0..WARM_UP + repeat {
         let stages = STAGES.map(|(_, stage)| milliseconds(|| stage(&mut apart)));
-        let mut outcome = Ok(Default::default());
+        let mut outcome = Ok(());
         let step = milliseconds(|| outcome = whole.step(0, &rates));
         outcome.context("a step of the session")?;
         if number < WARM_UP {

@@ -43,6 +43,11 @@ impl Plateau {
         Self { window, improvement, seen: 0, sum: 0.0, previous: f64::INFINITY }
     }
 
+    /// Whether a window closes with the loss of step number `steps`: others need not be taken yet.
+    pub fn is_due(&self, steps: u32) -> bool {
+        self.window > 0 && steps.is_multiple_of(self.window)
+    }
+
     /// Takes the loss of one step.
     pub fn is_reached(&mut self, loss: f32) -> bool {
         if self.window == 0 {

@@ -1,13 +1,9 @@
 //! The [`Engine`] that the stages make.
 
-use super::{
-    footprint_moments,
-    pass::Pass,
-    session::{CpuSession, check_size},
-};
+use super::{footprint_moments, pass::Pass, session::CpuSession};
 use crate::{
     cameras::Camera,
-    engine::{Engine, EngineError, Rendering, Session, SessionInput},
+    engine::{Engine, EngineError, Rendering, Session, SessionInput, check_size},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     motion::{moments::FootprintMoments, reweighting::Reweighting},

@@ -3,8 +3,8 @@
 use super::pass::Pass;
 use crate::{
     cameras::Camera,
-    engine::{DensityStatistics, EngineError, Session, SessionInput, StepReport},
-    gaussians::{Gaussians, gradients::GaussianGradients, validate::validate},
+    engine::{DensityStatistics, EngineError, Session, SessionInput},
+    gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
     optim::{Adam, LearningRates},
@@ -32,11 +32,13 @@ pub(super) struct CpuSession {
     gradients: GaussianGradients,
     adam: Adam,
     density: DensityStatistics,
+    /// Of the steps since they were last taken.
+    losses: Vec<f32>,
 }
 
 impl CpuSession {
     pub(super) fn new(input: SessionInput, instructions: Instructions) -> Result<Self, EngineError> {
-        check(&input)?;
+        input.validate()?;
         let count = input.gaussians.len();
         let views = input
             .views
@@ -59,6 +61,7 @@ impl CpuSession {
             rendered: Image::filled(0, 0, [0.0; 3]),
             image_gradient: Vec::new(),
             workspace: LossWorkspace::new(instructions),
+            losses: Vec::new(),
         })
     }
 
@@ -73,7 +76,7 @@ impl CpuSession {
 }
 
 impl Session for CpuSession {
-    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<StepReport, EngineError> {
+    fn step(&mut self, view: usize, rates: &LearningRates) -> Result<(), EngineError> {
         if view >= self.views.len() {
             return Err(EngineError::InvalidInput(format!("view {view} of {}", self.views.len())));
         }
@@ -98,10 +101,15 @@ impl Session for CpuSession {
         }
         let active = (!self.active.is_empty()).then_some(self.active.as_slice());
         self.adam.step(&mut self.gaussians, &self.gradients, rates, active);
-        Ok(StepReport { loss: value })
+        self.losses.push(value);
+        Ok(())
     }
 
-    fn gaussians(&self) -> Result<Gaussians, EngineError> {
+    fn take_losses(&mut self) -> Result<Vec<f32>, EngineError> {
+        Ok(std::mem::take(&mut self.losses))
+    }
+
+    fn gaussians(&mut self) -> Result<Gaussians, EngineError> {
         Ok(self.gaussians.clone())
     }
 
@@ -142,46 +150,4 @@ impl Session for CpuSession {
 
 fn empty_statistics(count: usize) -> DensityStatistics {
     DensityStatistics { gradient_norm: vec![0.0; count], visible_steps: vec![0; count] }
-}
-
-/// An image without pixels has no rows to hand out.
-pub(super) fn check_size(camera: &Camera) -> Result<(), EngineError> {
-    if camera.width == 0 || camera.height == 0 {
-        let (width, height) = (camera.width, camera.height);
-        return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
-    }
-    Ok(())
-}
-
-fn check(input: &SessionInput) -> Result<(), EngineError> {
-    if input.views.is_empty() {
-        return Err(EngineError::InvalidInput("no training view; give at least one".into()));
-    }
-    validate(&input.gaussians).map_err(|error| EngineError::InvalidInput(error.to_string()))?;
-    let count = input.gaussians.len();
-    if !(input.frozen.is_empty() || input.frozen.len() == count) {
-        return Err(EngineError::InvalidInput(format!(
-            "{} frozen flags for {count} Gaussians",
-            input.frozen.len()
-        )));
-    }
-    for (number, view) in input.views.iter().enumerate() {
-        let (image, camera) = (&view.image, &view.camera);
-        check_size(camera)?;
-        if (image.width, image.height) != (camera.width, camera.height) {
-            return Err(EngineError::InvalidInput(format!(
-                "training image {number} is {}x{}, its camera {}x{}",
-                image.width, image.height, camera.width, camera.height
-            )));
-        }
-        if let Some(mask) = &view.mask
-            && (mask.width, mask.height) != (camera.width, camera.height)
-        {
-            return Err(EngineError::InvalidInput(format!(
-                "training mask {number} is {}x{}, its camera {}x{}",
-                mask.width, mask.height, camera.width, camera.height
-            )));
-        }
-    }
-    Ok(())
 }

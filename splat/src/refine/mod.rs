@@ -73,12 +73,21 @@ pub fn refine(
     let mut losses = Vec::new();
     for step in 0..settings.iterations {
         let view = epochs.next(&mut random);
-        let loss = session.step(view, &rates(settings, step, extent, sh_degree))?.loss;
-        losses.push(loss);
-        if progress(step + 1, settings.iterations).is_break() {
+        session.step(view, &rates(settings, step, extent, sh_degree))?;
+        let done = step + 1;
+        if progress(done, settings.iterations).is_break() {
             return Ok(None);
         }
-        if plateau.is_reached(loss) {
+        // Losses wait on the device until they decide something.
+        if !(plateau.is_due(done) || done == settings.iterations) {
+            continue;
+        }
+        let mut is_flat = false;
+        for loss in session.take_losses()? {
+            is_flat |= plateau.is_reached(loss);
+            losses.push(loss);
+        }
+        if is_flat {
             break;
         }
     }

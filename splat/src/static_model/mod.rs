@@ -135,6 +135,9 @@ fn finite(gaussians: &Gaussians) -> Result<Gaussians, StaticModelError> {
     Ok(gaussians.select(&kept))
 }
 
+/// Steps between two looks at the loss for reports: a device need not wait for the host in between.
+const LOSS_INTERVAL: u32 = 16;
+
 struct Optimisation<'a> {
     session: Box<dyn Session>,
     settings: &'a StaticModelSettings,
@@ -154,9 +157,10 @@ impl Optimisation<'_> {
             Plateau::new(self.settings.plateau_window, self.settings.plateau_improvement, self.views);
         let mut epochs = Epochs::new(self.views);
         let mut count = self.session.gaussians()?.len();
+        let (mut loss, mut losses) = (0.0, 0);
         for step in 0..steps {
             let view = epochs.next(&mut self.random);
-            let loss = self.session.step(view, &self.rates(step))?.loss;
+            self.session.step(view, &self.rates(step))?;
             let done = step + 1;
             if done >= self.settings.densify_from
                 && done <= grow_until
@@ -164,11 +168,19 @@ impl Optimisation<'_> {
             {
                 count = self.densify(done < grow_until)?;
             }
+            let is_due = done > grow_until && plateau.is_due(done - grow_until);
+            let mut is_flat = false;
+            if is_due || done == steps || done.is_multiple_of(LOSS_INTERVAL) {
+                for value in self.session.take_losses()? {
+                    (loss, losses) = (value, losses + 1);
+                    is_flat |= losses > grow_until && plateau.is_reached(value);
+                }
+            }
             let report = StaticModelProgress { step: done, steps, gaussians: count, loss };
             if progress(report).is_break() {
                 return Err(StaticModelError::Cancelled);
             }
-            if done > grow_until && plateau.is_reached(loss) {
+            if is_flat {
                 break;
             }
         }

@@ -30,7 +30,7 @@ mod tests;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::{MotionField, MotionOrigin, MotionView};
+use super::{MotionField, MotionOrigin, MotionView, OrderCounts};
 use crate::{
     engine::{Engine, EngineError},
     gaussians::Gaussians,
@@ -124,6 +124,8 @@ pub(super) fn estimate(
         rotation: spread.rotation,
         information: vec![DMat3::ZERO; gaussians.len()],
         turns_harmonics: false,
+        log_scale: vec![DVec3::ZERO; gaussians.len()],
+        orders: OrderCounts::default(),
     })
 }
 
@@ -149,12 +151,13 @@ fn sights(
 ) -> Result<Vec<Vec<Sight>>, EngineError> {
     let mut sights = vec![Vec::new(); gaussians.len()];
     for (view, MotionView { camera, tracks }) in views.iter().enumerate() {
-        let all = engine.footprint_moments(gaussians, camera, &weighted_by_blending(tracks, |_| true))?;
+        let all = engine.footprint_moments(gaussians, camera, &weighted_by_blending(tracks, |_| true), None)?;
         let still = fixed::still_pixels(tracks);
         let still = engine.footprint_moments(
             gaussians,
             camera,
             &weighted_by_blending(tracks, |pixel| still[pixel]),
+            None,
         )?;
         let size = DVec2::new(camera.width.into(), camera.height.into());
         sights.par_iter_mut().zip(&all).zip(&still).for_each(|((list, moments), still)| {

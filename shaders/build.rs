@@ -1,0 +1,53 @@
+//! Composes every stage with the shared modules that it imports, validates it against WebGPU's base capabilities, and
+//! writes plain WGSL for `src/kernels.rs` to include. A shader that is wrong fails the build with its file and line.
+
+use std::{env, error::Error, fs, path::Path};
+
+use naga::{
+    back::wgsl::WriterFlags,
+    valid::{Capabilities, ValidationFlags, Validator},
+};
+use naga_oil::compose::{ComposableModuleDescriptor, Composer, NagaModuleDescriptor};
+
+/// Modules that stages import; each after those that it imports itself.
+const SHARED: [&str; 5] = ["types", "projection", "harmonics", "tiles", "footprint"];
+
+fn main() -> Result<(), Box<dyn Error>> {
+    println!("cargo:rerun-if-changed=wgsl");
+    let out = env::var("OUT_DIR")?;
+    let mut composer = Composer::default();
+    for name in SHARED {
+        let path = format!("wgsl/shared/{name}.wgsl");
+        let source = fs::read_to_string(&path)?;
+        let descriptor =
+            ComposableModuleDescriptor { source: &source, file_path: &path, ..Default::default() };
+        if let Err(error) = composer.add_composable_module(descriptor) {
+            return Err(error.emit_to_string(&composer).into());
+        }
+    }
+    for entry in fs::read_dir("wgsl")? {
+        let path = entry?.path();
+        if path.extension().is_some_and(|extension| extension == "wgsl") {
+            let plain = compose(&mut composer, &path)?;
+            let name = path.file_name().ok_or("a file without a name")?;
+            fs::write(Path::new(&out).join(name), plain)?;
+        }
+    }
+    Ok(())
+}
+
+/// The stage in plain WGSL.
+fn compose(composer: &mut Composer, path: &Path) -> Result<String, Box<dyn Error>> {
+    let source = fs::read_to_string(path)?;
+    let file_path = path.to_str().ok_or("a path that is not Unicode")?;
+    let descriptor = NagaModuleDescriptor { source: &source, file_path, ..Default::default() };
+    let module = match composer.make_naga_module(descriptor) {
+        Ok(module) => module,
+        Err(error) => return Err(error.emit_to_string(composer).into()),
+    };
+    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+    let info = validator
+        .validate(&module)
+        .map_err(|error| format!("{file_path}: {}", error.emit_to_string_with_path(&source, file_path)))?;
+    Ok(naga::back::wgsl::write_string(&module, &info, WriterFlags::empty())?)
+}

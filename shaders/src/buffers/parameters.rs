@@ -1,0 +1,53 @@
+//! The parameters of a set on the device.
+
+use splat::{engine::EngineError, gaussians::Gaussians};
+use wgpu::Buffer;
+
+use super::{Request, allocate, storage};
+use crate::{device::GpuDevice, layout::GEOMETRY};
+
+/// Parameters as the kernels read them: mean, rotation, log scale and logit opacity of each Gaussian in a row.
+pub(crate) fn interleaved(gaussians: &Gaussians) -> Vec<f32> {
+    let mut values = Vec::with_capacity(GEOMETRY * gaussians.len());
+    for index in 0..gaussians.len() {
+        values.extend(gaussians.means[index]);
+        values.extend(gaussians.rotations[index]);
+        values.extend(gaussians.log_scales[index]);
+        values.push(gaussians.logit_opacities[index]);
+    }
+    values
+}
+
+/// The inverse of [`interleaved`].
+pub(crate) fn separated(geometry: &[[f32; GEOMETRY]], sh: Vec<f32>, sh_degree: u32) -> Gaussians {
+    Gaussians {
+        means: geometry.iter().map(|row| [row[0], row[1], row[2]]).collect(),
+        rotations: geometry.iter().map(|row| [row[3], row[4], row[5], row[6]]).collect(),
+        log_scales: geometry.iter().map(|row| [row[7], row[8], row[9]]).collect(),
+        logit_opacities: geometry.iter().map(|row| row[10]).collect(),
+        sh,
+        sh_degree,
+    }
+}
+
+/// The parameters of a set.
+#[derive(Clone, Debug)]
+pub(crate) struct ParameterBuffers {
+    pub geometry: Buffer,
+    pub sh: Buffer,
+}
+
+impl ParameterBuffers {
+    pub(super) fn requests(count: u64, coefficients: u64) -> [Request; 2] {
+        [storage("geometry", 4 * GEOMETRY as u64 * count), storage("sh", 12 * coefficients * count)]
+    }
+
+    /// Uploads a set.
+    pub(crate) fn new(device: &GpuDevice, gaussians: &Gaussians) -> Result<Self, EngineError> {
+        let requests = Self::requests(gaussians.len() as u64, gaussians.sh_coefficients() as u64);
+        let [geometry, sh] = allocate(device, requests)?;
+        device.queue.write_buffer(&geometry, 0, bytemuck::cast_slice(&interleaved(gaussians)));
+        device.queue.write_buffer(&sh, 0, bytemuck::cast_slice(&gaussians.sh));
+        Ok(Self { geometry, sh })
+    }
+}

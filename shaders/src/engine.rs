@@ -1,0 +1,179 @@
+//! The [`Engine`] that the stages make.
+
+use std::sync::Arc;
+
+use bytemuck::bytes_of;
+use splat::{
+    cameras::Camera,
+    engine::{Engine, EngineError, Rendering, Session, SessionInput, check_size},
+    gaussians::{Gaussians, gradients::GaussianGradients},
+    image::Image,
+    motion::moments::FootprintMoments,
+    tracking::TrackField,
+};
+
+use crate::{
+    buffers::{Buffers, GradientBuffers, Size, admit, first_capacity, separated},
+    device::GpuDevice,
+    kernels::Kernels,
+    layout::{GEOMETRY, State, Step, View},
+    program::record,
+    readback::read,
+    session::GpuSession,
+    stages::{Binder, ViewBuffer},
+};
+
+/// An opened device and its compiled kernels.
+#[derive(Debug)]
+pub(crate) struct Context {
+    pub device: GpuDevice,
+    pub kernels: Kernels,
+}
+
+/// The GPU engine.
+#[derive(Clone, Debug)]
+pub struct GpuEngine {
+    pub(crate) context: Arc<Context>,
+}
+
+impl GpuEngine {
+    /// Compiles the kernels for a device.
+    pub fn new(device: GpuDevice) -> Result<Self, EngineError> {
+        let kernels = Kernels::new(&device.device);
+        device.check()?;
+        Ok(Self { context: Arc::new(Context { device, kernels }) })
+    }
+
+    /// The device.
+    pub fn device(&self) -> &GpuDevice {
+        &self.context.device
+    }
+
+    /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
+    /// `H × W × 3`, `alpha_gradient` `H × W` or empty.
+    pub fn render_backward(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        image_gradient: &[f32],
+        alpha_gradient: &[f32],
+    ) -> Result<GaussianGradients, EngineError> {
+        check_size(camera)?;
+        let Context { device, kernels } = &*self.context;
+        let view = ViewBuffer::new(device, View::new(camera, background))?;
+        let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
+        let gradients = GradientBuffers::new(device, &buffers.size)?;
+        let alpha = alpha_gradient.iter().copied().chain(std::iter::repeat(0.0));
+        let pixels: Vec<f32> = image_gradient
+            .as_chunks::<3>()
+            .0
+            .iter()
+            .zip(alpha)
+            .flat_map(|([red, green, blue], alpha)| [*red, *green, *blue, alpha])
+            .collect();
+        device.queue.write_buffer(&gradients.image, 0, bytemuck::cast_slice(&pixels));
+        let mut encoder = device.device.create_command_encoder(&Default::default());
+        record(&mut encoder, "gradient", &Binder { device, kernels }.backward(&buffers, &gradients, &view));
+        device.queue.submit([encoder.finish()]);
+        let geometry: Vec<[f32; GEOMETRY]> = read(device, &gradients.geometry, gaussians.len())?;
+        let sh = read(device, &gradients.sh, gaussians.sh.len())?;
+        let Gaussians { means, rotations, log_scales, logit_opacities, sh, .. } =
+            separated(&geometry, sh, gaussians.sh_degree);
+        Ok(GaussianGradients { means, rotations, log_scales, logit_opacities, sh })
+    }
+
+    /// Buffers for one view with room for what it probably needs.
+    pub(crate) fn buffers(
+        &self,
+        gaussians: &Gaussians,
+        view: &View,
+        has_gradient: bool,
+    ) -> Result<Buffers, EngineError> {
+        let device = &self.context.device;
+        let (count, tiles) = (gaussians.len() as u64, view.tile_count().into());
+        let size = Size {
+            count,
+            coefficients: gaussians.sh_coefficients() as u64,
+            pixels: view.pixels(),
+            tiles,
+            capacity: first_capacity(count, tiles),
+            has_gradient,
+        };
+        admit(device, &Buffers::requests(&size))?;
+        Buffers::new(device, gaussians, &size)
+    }
+
+    /// Stages 1 to 3, with more room until there is enough.
+    pub(crate) fn draw(
+        &self,
+        gaussians: &Gaussians,
+        view: &ViewBuffer,
+        mut buffers: Buffers,
+    ) -> Result<Buffers, EngineError> {
+        let Context { device, kernels } = &*self.context;
+        loop {
+            let step = Step {
+                count: gaussians.len() as u32,
+                coefficients: gaussians.sh_coefficients() as u32,
+                degree: gaussians.sh_degree,
+                capacity: buffers.size.capacity as u32,
+                ..Step::default()
+            };
+            let state = State { gaussians: step.count, ..State::default() };
+            device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
+            device.queue.write_buffer(&buffers.common.state, 0, bytes_of(&state));
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            record(&mut encoder, "render", &Binder { device, kernels }.forward(&buffers, view));
+            device.queue.submit([encoder.finish()]);
+            let state: Vec<State> = read(device, &buffers.common.state, 1)?;
+            if state[0].failed == 0 {
+                return Ok(buffers);
+            }
+            let size = buffers.size.with_room(device, state[0].needed)?;
+            admit(device, &Buffers::requests(&size))?;
+            buffers.resize(device, size)?;
+        }
+    }
+}
+
+impl Engine for GpuEngine {
+    fn name(&self) -> &str {
+        "gpu"
+    }
+
+    fn render(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+    ) -> Result<Rendering, EngineError> {
+        check_size(camera)?;
+        let view = ViewBuffer::new(&self.context.device, View::new(camera, background))?;
+        let buffers = self.buffers(gaussians, &view.data, false)?;
+        let buffers = self.draw(gaussians, &view, buffers)?;
+        let pixels: Vec<[f32; 4]> =
+            read(&self.context.device, &buffers.images.rendered, view.data.pixels() as usize)?;
+        let image = Image {
+            width: camera.width,
+            height: camera.height,
+            pixels: pixels.iter().flat_map(|[red, green, blue, _]| [*red, *green, *blue]).collect(),
+        };
+        Ok(Rendering { image, alpha: pixels.iter().map(|[.., transmittance]| 1.0 - transmittance).collect() })
+    }
+
+    fn footprint_moments(
+        &self,
+        _gaussians: &Gaussians,
+        _camera: &Camera,
+        _tracks: &TrackField,
+    ) -> Result<Vec<FootprintMoments>, EngineError> {
+        Err(EngineError::InvalidInput(
+            "the GPU engine does not measure footprints; use the CPU engine for motion".to_owned(),
+        ))
+    }
+
+    fn session(&self, input: SessionInput) -> Result<Box<dyn Session>, EngineError> {
+        Ok(Box::new(GpuSession::new(Arc::clone(&self.context), input)?))
+    }
+}
