@@ -14,6 +14,9 @@ mod reference;
 mod row;
 
 mod metrics;
+mod motion;
+
+use motion::lift as motion_lift;
 
 /// A test for every sweep, and the list of them.
 macro_rules! sweeps {
@@ -31,4 +34,4 @@ macro_rules! sweeps {
 }
 
 // In the order of a training step.
-sweeps! { metrics }
+sweeps! { motion_lift, metrics }

@@ -10,9 +10,10 @@
 //! | motion of unobserved Gaussians from agreeing neighbours | `propagate` |
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
+//! | an order that the input's order does not change | `value_order` |
 //!
-//! Solves run in double precision; sums are in index order, so that the result does not depend on the number
-//! of threads.
+//! Solves run in double precision; sums are in the order of the Gaussians' values, so that the result depends
+//! neither on the number of threads nor on the order of the Gaussians.
 
 mod apply;
 mod fit2d;
@@ -28,6 +29,7 @@ mod settings;
 mod static_test;
 #[cfg(test)]
 mod tests;
+mod value_order;
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -45,6 +47,7 @@ use neighbours::Neighbourhood;
 use observe::Observation;
 use propagate::{Context, State};
 use rotation::{Deformation, Member};
+use value_order::ValueOrder;
 
 /// How a Gaussian's motion was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -84,10 +87,23 @@ pub struct MotionView {
 
 /// Motion of every Gaussian of the static model to the frame that the tracks lead to.
 ///
+/// Depends on the Gaussians' values, not on their order; equal Gaussians move alike.
+///
 /// # Errors
 /// [`EngineError::InvalidInput`] if tracks and camera of a view differ in size; otherwise whatever the engine
 /// reports.
 pub fn estimate(
+    engine: &dyn Engine,
+    gaussians: &Gaussians,
+    views: &[MotionView],
+    settings: &MotionSettings,
+) -> Result<MotionField, EngineError> {
+    let order = ValueOrder::of(gaussians);
+    let field = estimate_in_order(engine, &order.sorted(gaussians), views, settings)?;
+    Ok(order.restored(&field))
+}
+
+fn estimate_in_order(
     engine: &dyn Engine,
     gaussians: &Gaussians,
     views: &[MotionView],

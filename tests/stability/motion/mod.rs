@@ -1,0 +1,7 @@
+//! Motion compensation against dense least squares in double precision, and what noise propagation predicts.
+
+mod judge;
+pub(crate) mod lift;
+mod prescribed;
+mod reference;
+mod scene;

@@ -1,0 +1,217 @@
+//! An engine whose footprints are prescribed: exact projections of points on a Gaussian, so that geometry alone is
+//! under test.
+
+use std::sync::Arc;
+
+use glam::{DMat2, DMat3, DVec2, DVec3};
+use rand::RngExt;
+use splat::{
+    cameras::Camera,
+    engine::{Engine, EngineError, Rendering, Session, SessionInput},
+    gaussians::Gaussians,
+    motion::{MotionView, moments::FootprintMoments},
+    raster::LOW_PASS,
+    tracking::TrackField,
+};
+
+use super::scene::{Rigid, normal, random};
+
+/// Samples per side of a footprint, and how far they reach in standard deviations.
+const SIDE: i32 = 5;
+const REACH: f64 = 1.5;
+
+/// One tracked point of a Gaussian.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sample {
+    /// Blending weight times pixels.
+    pub weight: f64,
+    pub from: DVec2,
+    pub to: DVec2,
+    /// Whether it is in front of the camera and inside the image in both frames.
+    pub is_visible: bool,
+}
+
+/// How tracks err.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Noise {
+    /// Each sample on its own.
+    Independent(f64),
+    /// All samples of a footprint alike.
+    Alike(f64),
+}
+
+impl Noise {
+    pub(super) fn deviation(self) -> f64 {
+        match self {
+            Self::Independent(deviation) | Self::Alike(deviation) => deviation,
+        }
+    }
+}
+
+/// What moves how, and how it is tracked.
+#[derive(Clone, Debug)]
+pub(super) struct Scene {
+    pub gaussians: Gaussians,
+    pub cameras: Vec<Camera>,
+    pub motion: Rigid,
+    pub noise: Noise,
+    /// Share of the views of each Gaussian whose track leads anywhere.
+    pub outliers: f64,
+    pub seed: u64,
+}
+
+impl Scene {
+    pub(super) fn views(&self) -> Vec<MotionView> {
+        let (width, height) = self.cameras.first().map_or((1, 1), |camera| (camera.width, camera.height));
+        let pixels = width as usize * height as usize;
+        let tracks = Arc::new(TrackField {
+            width,
+            height,
+            positions: vec![[0.5; 2]; pixels],
+            visible: vec![true; pixels],
+            sigma: vec![1.0; pixels],
+        });
+        self.cameras
+            .iter()
+            .map(|camera| MotionView { camera: camera.clone(), tracks: Arc::clone(&tracks) })
+            .collect()
+    }
+
+    /// Whether the track of the Gaussian at `mean` leads anywhere in this view: in exactly the stated share of the
+    /// views, rounded down.
+    pub(super) fn has_outlier(&self, mean: DVec3, camera: &Camera) -> bool {
+        let rank = |camera: &Camera| hash(self.seed ^ 0x5eed, mean, camera);
+        let own = rank(camera);
+        let before = self.cameras.iter().filter(|other| rank(other) < own).count();
+        before < (self.outliers * self.cameras.len() as f64) as usize
+    }
+
+    /// The tracked points of a Gaussian in one view. Depends on the Gaussian and the view by their values alone.
+    pub(super) fn samples(&self, gaussians: &Gaussians, index: usize, camera: &Camera) -> Vec<Sample> {
+        let mean = gaussians.mean(index);
+        if camera.project_world(mean).is_none() {
+            return Vec::new();
+        }
+        let mut random = random(hash(self.seed, mean, camera));
+        let size = DVec2::new(camera.width.into(), camera.height.into());
+        let lost = DVec2::new(random.random_range(0.0..1.0), random.random_range(0.0..1.0)) * size;
+        let alike = DVec2::new(normal(&mut random), normal(&mut random));
+        let is_outlier = self.has_outlier(mean, camera);
+        let [wide, high] = major_axes(gaussians, index);
+        let step = 2.0 * REACH / f64::from(SIDE - 1);
+        let grid = (0..SIDE * SIDE)
+            .map(|k| DVec2::new(f64::from(k % SIDE), f64::from(k / SIDE)) * step - DVec2::splat(REACH));
+        let mut samples: Vec<Sample> = grid
+            .map(|at| {
+                let point = mean + wide * at.x + high * at.y;
+                let from = camera.project_world(point);
+                let to = camera.project_world(self.motion.of(point)).map(|exact| match self.noise {
+                    _ if is_outlier => {
+                        exact + lost - camera.project_world(self.motion.of(mean)).unwrap_or(exact)
+                    }
+                    Noise::Independent(deviation) => {
+                        exact + DVec2::new(normal(&mut random), normal(&mut random)) * deviation
+                    }
+                    Noise::Alike(deviation) => exact + alike * deviation,
+                });
+                let is_visible = to.is_some_and(|to| camera.contains(to)) && from.is_some();
+                Sample {
+                    weight: (-0.5 * at.length_squared()).exp(),
+                    from: from.unwrap_or(DVec2::ZERO),
+                    to: to.unwrap_or(DVec2::ZERO),
+                    is_visible,
+                }
+            })
+            .collect();
+        let total: f64 = samples.iter().map(|sample| sample.weight).sum();
+        let unoccluded = unoccluded_weight(gaussians, index, camera);
+        samples.iter_mut().for_each(|sample| sample.weight *= unoccluded / total);
+        samples
+    }
+}
+
+/// The two longest axes of a Gaussian, one standard deviation long.
+pub(super) fn major_axes(gaussians: &Gaussians, index: usize) -> [DVec3; 2] {
+    let axes = DMat3::from_quat(gaussians.rotation(index));
+    let mut axes: [DVec3; 3] =
+        std::array::from_fn(|k| axes.col(k) * f64::from(gaussians.log_scales[index][k]).exp());
+    axes.sort_by(|a, b| b.length().total_cmp(&a.length()));
+    [axes[0], axes[1]]
+}
+
+/// What the blending weights of a Gaussian with nothing before it add up to.
+fn unoccluded_weight(gaussians: &Gaussians, index: usize, camera: &Camera) -> f64 {
+    let [u, v] = camera.world_jacobian(camera.to_camera(gaussians.mean(index)));
+    let covariance = gaussians.covariance(index);
+    let uv = u.dot(covariance * v);
+    let footprint = DMat2::from_cols(
+        DVec2::new(u.dot(covariance * u) + LOW_PASS, uv),
+        DVec2::new(uv, v.dot(covariance * v) + LOW_PASS),
+    );
+    gaussians.opacity(index) * std::f64::consts::TAU * footprint.determinant().sqrt()
+}
+
+fn hash(seed: u64, mean: DVec3, camera: &Camera) -> u64 {
+    let values = mean.to_array().into_iter().chain(camera.rotation.to_cols_array());
+    let values = values.chain(camera.translation.to_array());
+    values.fold(seed ^ 0xcbf2_9ce4_8422_2325, |hash, value| {
+        (hash ^ value.to_bits()).wrapping_mul(0x0100_0000_01b3).rotate_left(29)
+    })
+}
+
+/// Measures the prescribed footprints of a scene.
+pub(super) struct Prescribed<'a>(pub &'a Scene);
+
+impl Engine for Prescribed<'_> {
+    fn name(&self) -> &str {
+        "prescribed"
+    }
+
+    fn render(&self, _: &Gaussians, _: &Camera, _: [f32; 3]) -> Result<Rendering, EngineError> {
+        Err(EngineError::InvalidInput("prescribed footprints cannot be drawn".into()))
+    }
+
+    fn footprint_moments(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        _: &TrackField,
+    ) -> Result<Vec<FootprintMoments>, EngineError> {
+        let variance = self.0.noise.deviation().max(1e-3).powi(2);
+        let of = |index| moments(&self.0.samples(gaussians, index, camera), variance);
+        Ok((0..gaussians.len()).map(of).collect())
+    }
+
+    fn session(&self, _: SessionInput) -> Result<Box<dyn Session>, EngineError> {
+        Err(EngineError::InvalidInput("prescribed footprints cannot be refined".into()))
+    }
+}
+
+/// Centred moments in two passes, by their definition.
+pub(super) fn moments(samples: &[Sample], variance: f64) -> FootprintMoments {
+    let blend_weight: f64 = samples.iter().map(|sample| sample.weight).sum();
+    let mut m = FootprintMoments { blend_weight, ..FootprintMoments::default() };
+    let visible: Vec<&Sample> = samples.iter().filter(|sample| sample.is_visible).collect();
+    if visible.is_empty() {
+        return m;
+    }
+    let weight: f64 = visible.iter().map(|s| s.weight).sum();
+    let mean = |of: fn(&Sample) -> DVec2| visible.iter().map(|s| of(s) * s.weight).sum::<DVec2>() / weight;
+    let (source, target) = (mean(|s| s.from), mean(|s| s.to));
+    m.pixels = visible.len() as u32;
+    (m.centroid, m.tracked_centroid) = (source.to_array(), target.to_array());
+    for sample in visible {
+        let w = sample.weight / variance;
+        let (d, e) = (sample.from - source, sample.to - target);
+        m.weight += w;
+        m.weight_squared += w * w;
+        m.variance += sample.weight;
+        let add = |sums: &mut [f64], products: &[f64]| {
+            sums.iter_mut().zip(products).for_each(|(sum, product)| *sum += w * product);
+        };
+        add(&mut m.source, &[d.x * d.x, d.x * d.y, d.y * d.y]);
+        add(&mut m.cross, &[e.x * d.x, e.x * d.y, e.y * d.x, e.y * d.y]);
+        m.target += w * e.length_squared();
+    }
+    m
+}
