@@ -16,7 +16,7 @@ mod row;
 mod metrics;
 mod motion;
 
-use motion::lift as motion_lift;
+use motion::{footprints as motion_footprints, lift as motion_lift};
 
 /// A test for every sweep, and the list of them.
 macro_rules! sweeps {
@@ -34,4 +34,4 @@ macro_rules! sweeps {
 }
 
 // In the order of a training step.
-sweeps! { motion_lift, metrics }
+sweeps! { motion_footprints, motion_lift, metrics }

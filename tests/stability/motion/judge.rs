@@ -4,7 +4,7 @@ use glam::DVec3;
 use splat::motion::{MotionField, MotionOrigin, MotionSettings, estimate};
 
 use super::{
-    prescribed::{Prescribed, Scene},
+    prescribed::{Prescribed, Scene, Tracked},
     reference::{Prediction, Sight, predict, sights},
 };
 use crate::row::{Bar, Row};
@@ -116,29 +116,34 @@ pub(super) fn lone(row: &mut Row, scene: &Scene) -> Origins {
 pub(super) fn together(row: &mut Row, scene: &Scene) -> Origins {
     let settings = MotionSettings::default();
     let field = estimate(&Prescribed(scene), &scene.gaussians, &scene.views(), &settings).unwrap();
-    if !is_sound(&field, scene.gaussians.len()) {
-        row.case(f64::NAN, 1.0);
-    }
-    for index in 0..scene.gaussians.len() {
-        judge(row, scene, &field, index, &settings);
-    }
+    judge_all(row, scene, &field, &settings);
     Origins::of(&field)
 }
 
-fn judge(row: &mut Row, scene: &Scene, field: &MotionField, index: usize, settings: &MotionSettings) {
-    let mean = scene.gaussians.mean(index);
-    let truth = scene.motion.of(mean);
+/// Adds a case for every Gaussian of a field.
+pub(super) fn judge_all(row: &mut Row, scene: &impl Tracked, field: &MotionField, settings: &MotionSettings) {
+    if !is_sound(field, scene.gaussians().len()) {
+        row.case(f64::NAN, 1.0);
+    }
+    for index in 0..scene.gaussians().len() {
+        judge(row, scene, field, index, settings);
+    }
+}
+
+fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize, settings: &MotionSettings) {
+    let mean = scene.gaussians().mean(index);
+    let truth = scene.motion().of(mean);
     let sights = sights(scene, index, settings);
     let prediction = predict(&sights, truth);
     // Wrong views are among the cameras; views that do not see the Gaussian have no say.
-    let wrong = scene.cameras.iter().filter(|camera| scene.has_outlier(mean, camera)).count();
+    let wrong = scene.cameras().iter().filter(|camera| scene.has_outlier(mean, camera)).count();
     let demand = demand(prediction.as_ref(), sights.len() + wrong, settings);
     let error = (mean + field.translation[index] - truth).length();
     match (field.origin[index], prediction) {
         (MotionOrigin::Solved, Some(prediction)) if demand != Demand::Fallback => {
             // Rounding of a world position, when its origin is far.
             let rounding = f64::EPSILON * (mean.length() + truth.length());
-            let told = if scene.gaussians.len() > 1 { prediction.assumed } else { 0.0 };
+            let told = if scene.gaussians().len() > 1 { prediction.assumed } else { 0.0 };
             let predicted = prediction.deviation.hypot(told) + rounding;
             if error > row.bar.factor * predicted {
                 println!("{}: error {error} of {prediction:?}", row.extreme);

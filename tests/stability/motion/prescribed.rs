@@ -4,7 +4,6 @@
 use std::sync::Arc;
 
 use glam::{DMat2, DMat3, DVec2, DVec3};
-use rand::RngExt;
 use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
@@ -14,7 +13,10 @@ use splat::{
     tracking::TrackField,
 };
 
-use super::scene::{Rigid, normal, random};
+use super::{
+    reference::LEAST_CLAIM,
+    scene::{Rigid, normal, random},
+};
 
 /// Samples per side of a footprint, and how far they reach in standard deviations.
 const SIDE: i32 = 5;
@@ -48,7 +50,19 @@ impl Noise {
     }
 }
 
-/// What moves how, and how it is tracked.
+/// A scene of which every tracked point of every Gaussian is known.
+pub(super) trait Tracked {
+    fn gaussians(&self) -> &Gaussians;
+    fn cameras(&self) -> &[Camera];
+    fn motion(&self) -> Rigid;
+    fn noise(&self) -> Noise;
+    /// Whether the track of the Gaussian at `mean` is wrong in this view.
+    fn has_outlier(&self, mean: DVec3, camera: &Camera) -> bool;
+    /// The tracked points of a Gaussian in one view, with the noise of the tracks or without.
+    fn samples(&self, index: usize, camera: &Camera, is_noisy: bool) -> Vec<Sample>;
+}
+
+/// A rigid body whose Gaussians are tracked at points of their own.
 #[derive(Clone, Debug)]
 pub(super) struct Scene {
     pub gaussians: Gaussians,
@@ -77,57 +91,83 @@ impl Scene {
             .collect()
     }
 
-    /// Whether the track of the Gaussian at `mean` leads anywhere in this view: in exactly the stated share of the
-    /// views, rounded down.
-    pub(super) fn has_outlier(&self, mean: DVec3, camera: &Camera) -> bool {
+}
+
+impl Tracked for Scene {
+    fn gaussians(&self) -> &Gaussians {
+        &self.gaussians
+    }
+
+    fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    fn motion(&self) -> Rigid {
+        self.motion
+    }
+
+    fn noise(&self) -> Noise {
+        self.noise
+    }
+
+    /// In exactly the stated share of the views, rounded down.
+    fn has_outlier(&self, mean: DVec3, camera: &Camera) -> bool {
         let rank = |camera: &Camera| hash(self.seed ^ 0x5eed, mean, camera);
         let own = rank(camera);
         let before = self.cameras.iter().filter(|other| rank(other) < own).count();
         before < (self.outliers * self.cameras.len() as f64) as usize
     }
 
-    /// The tracked points of a Gaussian in one view. Depends on the Gaussian and the view by their values alone.
-    pub(super) fn samples(&self, gaussians: &Gaussians, index: usize, camera: &Camera) -> Vec<Sample> {
-        let mean = gaussians.mean(index);
-        if camera.project_world(mean).is_none() {
-            return Vec::new();
-        }
-        let mut random = random(hash(self.seed, mean, camera));
-        let size = DVec2::new(camera.width.into(), camera.height.into());
-        let lost = DVec2::new(random.random_range(0.0..1.0), random.random_range(0.0..1.0)) * size;
-        let alike = DVec2::new(normal(&mut random), normal(&mut random));
-        let is_outlier = self.has_outlier(mean, camera);
-        let [wide, high] = major_axes(gaussians, index);
-        let step = 2.0 * REACH / f64::from(SIDE - 1);
-        let grid = (0..SIDE * SIDE)
-            .map(|k| DVec2::new(f64::from(k % SIDE), f64::from(k / SIDE)) * step - DVec2::splat(REACH));
-        let mut samples: Vec<Sample> = grid
-            .map(|at| {
-                let point = mean + wide * at.x + high * at.y;
-                let from = camera.project_world(point);
-                let to = camera.project_world(self.motion.of(point)).map(|exact| match self.noise {
-                    _ if is_outlier => {
-                        exact + lost - camera.project_world(self.motion.of(mean)).unwrap_or(exact)
-                    }
-                    Noise::Independent(deviation) => {
-                        exact + DVec2::new(normal(&mut random), normal(&mut random)) * deviation
-                    }
-                    Noise::Alike(deviation) => exact + alike * deviation,
-                });
-                let is_visible = to.is_some_and(|to| camera.contains(to)) && from.is_some();
-                Sample {
-                    weight: (-0.5 * at.length_squared()).exp(),
-                    from: from.unwrap_or(DVec2::ZERO),
-                    to: to.unwrap_or(DVec2::ZERO),
-                    is_visible,
-                }
-            })
-            .collect();
-        let total: f64 = samples.iter().map(|sample| sample.weight).sum();
-        let unoccluded = unoccluded_weight(gaussians, index, camera);
-        samples.iter_mut().for_each(|sample| sample.weight *= unoccluded / total);
-        samples
+    fn samples(&self, index: usize, camera: &Camera, is_noisy: bool) -> Vec<Sample> {
+        sampled(self, &self.gaussians, index, camera, is_noisy)
     }
+}
+
+/// Points on the disc of a Gaussian. Depends on the Gaussian and the view by their values alone, so that an order of
+/// the Gaussians other than the scene's makes no difference.
+fn sampled(
+    scene: &Scene,
+    gaussians: &Gaussians,
+    index: usize,
+    camera: &Camera,
+    is_noisy: bool,
+) -> Vec<Sample> {
+    let mean = gaussians.mean(index);
+    let Some(moved) = camera.project_world(mean).and(Some(camera.project_world(scene.motion.of(mean)))) else {
+        return Vec::new();
+    };
+    let mut random = random(hash(scene.seed, mean, camera));
+    let mut pair = || DVec2::new(normal(&mut random), normal(&mut random));
+    let size = DVec2::new(camera.width.into(), camera.height.into());
+    let (anywhere, alike) = (pair() * size, pair());
+    let is_lost = is_noisy && scene.has_outlier(mean, camera);
+    let lost = (anywhere.rem_euclid(size) - moved.unwrap_or_default()) * f64::from(u8::from(is_lost));
+    let [wide, high] = major_axes(gaussians, index);
+    let step = 2.0 * REACH / f64::from(SIDE - 1);
+    let grid = (0..SIDE * SIDE)
+        .map(|k| DVec2::new(f64::from(k % SIDE), f64::from(k / SIDE)) * step - DVec2::splat(REACH));
+    let mut samples: Vec<Sample> = grid
+        .map(|at| {
+            let point = mean + wide * at.x + high * at.y;
+            let error = match scene.noise {
+                _ if !is_noisy => DVec2::ZERO,
+                Noise::Independent(deviation) => pair() * deviation,
+                Noise::Alike(deviation) => alike * deviation,
+            };
+            let from = camera.project_world(point);
+            let to = camera.project_world(scene.motion.of(point)).map(|exact| exact + lost + error);
+            Sample {
+                weight: (-0.5 * at.length_squared()).exp(),
+                from: from.unwrap_or_default(),
+                to: to.unwrap_or_default(),
+                is_visible: to.is_some_and(|to| camera.contains(to)) && from.is_some(),
+            }
+        })
+        .collect();
+    let total: f64 = samples.iter().map(|sample| sample.weight).sum();
+    let unoccluded = unoccluded_weight(gaussians, index, camera);
+    samples.iter_mut().for_each(|sample| sample.weight *= unoccluded / total);
+    samples
 }
 
 /// The two longest axes of a Gaussian, one standard deviation long.
@@ -177,8 +217,8 @@ impl Engine for Prescribed<'_> {
         camera: &Camera,
         _: &TrackField,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
-        let variance = self.0.noise.deviation().max(1e-3).powi(2);
-        let of = |index| moments(&self.0.samples(gaussians, index, camera), variance);
+        let variance = self.0.noise.deviation().max(LEAST_CLAIM).powi(2);
+        let of = |index| moments(&sampled(self.0, gaussians, index, camera, true), variance);
         Ok((0..gaussians.len()).map(of).collect())
     }
 

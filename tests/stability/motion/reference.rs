@@ -5,7 +5,7 @@ use glam::{DVec2, DVec3};
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use splat::{cameras::Camera, motion::MotionSettings};
 
-use super::prescribed::{Noise, Sample, Scene};
+use super::prescribed::{Noise, Sample, Tracked};
 
 /// Where one view sees the Gaussian go.
 #[derive(Clone, Copy, Debug)]
@@ -33,66 +33,87 @@ pub(super) struct Prediction {
     pub views: usize,
 }
 
+/// Standard deviation that exact tracks claim, pixels.
+pub(super) const LEAST_CLAIM: f64 = 1e-3;
+
 fn vector(v: DVec3) -> Vector3<f64> {
     Vector3::new(v.x, v.y, v.z)
 }
 
-/// `target(from) = a + B (from − mean)` by weighted least squares: the target of the mean, and `‖B − I‖`.
-fn affine(samples: &[&Sample], mean: DVec2) -> (DVec2, f64) {
+/// A footprint's motion `to = from + a + B (from − mean)` by weighted least squares.
+struct Affine {
+    /// Where the mean goes.
+    target: DVec2,
+    /// `‖B‖`.
+    strain: f64,
+    /// Weighted mean square per axis of what remains.
+    residual: f64,
+}
+
+fn affine(samples: &[Sample], mean: DVec2) -> Affine {
+    let weight: f64 = samples.iter().map(|s| s.weight).sum();
+    let root = |row: usize| (samples[row].weight / weight).sqrt();
     let design = DMatrix::from_fn(samples.len(), 3, |row, column| {
         let offset = samples[row].from - mean;
-        samples[row].weight.sqrt() * [1.0, offset.x, offset.y][column]
+        root(row) * [1.0, offset.x, offset.y][column]
     });
     let right = DMatrix::from_fn(samples.len(), 2, |row, column| {
-        let moved = samples[row].to - samples[row].from;
-        samples[row].weight.sqrt() * [moved.x, moved.y][column]
+        root(row) * (samples[row].to - samples[row].from)[column]
     });
-    let svd = design.svd(true, true);
+    let svd = design.clone().svd(true, true);
     let solution = svd.solve(&right, 1e-12 * svd.singular_values.max()).expect("both factors were asked for");
-    let moved = DVec2::new(solution[(0, 0)], solution[(0, 1)]);
-    (mean + moved, solution.rows(1, 2).norm())
+    Affine {
+        target: mean + DVec2::new(solution[(0, 0)], solution[(0, 1)]),
+        strain: solution.rows(1, 2).norm(),
+        residual: 0.5 * (design * &solution - right).norm_squared(),
+    }
 }
 
 /// What the right views say about Gaussian `index`.
-pub(super) fn sights<'a>(scene: &'a Scene, index: usize, settings: &MotionSettings) -> Vec<Sight<'a>> {
-    let mean = scene.gaussians.mean(index);
-    let is_right = |camera: &&Camera| !scene.has_outlier(mean, camera);
-    scene.cameras.iter().filter(is_right).filter_map(|camera| sight(scene, index, camera, settings)).collect()
+pub(super) fn sights<'a>(
+    scene: &'a impl Tracked,
+    index: usize,
+    settings: &MotionSettings,
+) -> Vec<Sight<'a>> {
+    let mean = scene.gaussians().mean(index);
+    let right = scene.cameras().iter().filter(|camera| !scene.has_outlier(mean, camera));
+    right.filter_map(|camera| sight(scene, index, camera, settings)).collect()
 }
 
 fn sight<'a>(
-    scene: &Scene,
+    scene: &impl Tracked,
     index: usize,
     camera: &'a Camera,
     settings: &MotionSettings,
 ) -> Option<Sight<'a>> {
-    let mean = scene.gaussians.mean(index);
+    let mean = scene.gaussians().mean(index);
     let projected = camera.project_world(mean)?;
-    let exact = camera.project_world(scene.motion.of(mean)).filter(|&pixel| camera.contains(pixel))?;
-    let all = scene.samples(&scene.gaussians, index, camera);
-    let visible = |samples: &[Sample]| samples.iter().copied().filter(|s| s.is_visible).collect::<Vec<_>>();
+    let exact = camera.project_world(scene.motion().of(mean)).filter(|&pixel| camera.contains(pixel))?;
+    let all = scene.samples(index, camera, true);
     let weight = |samples: &[Sample]| samples.iter().map(|s| s.weight).sum::<f64>();
-    let seen = visible(&all);
-    if weight(&seen) <= settings.min_visible_share * weight(&all) || weight(&all) <= settings.min_blend_weight
-    {
+    let visible = |samples: Vec<Sample>| samples.into_iter().filter(|s| s.is_visible).collect::<Vec<_>>();
+    let blend_weight = weight(&all);
+    let seen = visible(all);
+    let is_observed = weight(&seen) > settings.min_visible_share * blend_weight
+        && blend_weight > settings.min_blend_weight
+        && seen.len() >= settings.min_pixels as usize;
+    if !is_observed {
         return None;
     }
-    let (pixel, _) = affine(&seen.iter().collect::<Vec<_>>(), projected);
-    let noiseless = Scene { noise: Noise::Alike(0.0), ..scene.clone() };
-    let noiseless = visible(&noiseless.samples(&scene.gaussians, index, camera));
-    let (modelled, strain) = affine(&noiseless.iter().collect::<Vec<_>>(), projected);
+    let fit = affine(&seen, projected);
+    let noiseless = affine(&visible(scene.samples(index, camera, false)), projected);
     let centroid = seen.iter().map(|s| s.from * s.weight).sum::<DVec2>() / weight(&seen);
     // A fit may as well take the centroid's motion for the mean's.
-    let model_error = (modelled - exact).length() + (centroid - projected).length() * strain;
+    let model_error = (noiseless.target - exact).length() + (centroid - projected).length() * noiseless.strain;
     let effective = weight(&seen).powi(2) / seen.iter().map(|s| s.weight * s.weight).sum::<f64>();
-    let noise = match scene.noise {
+    let noise = match scene.noise() {
         Noise::Independent(deviation) => deviation / effective.sqrt(),
         Noise::Alike(deviation) => deviation,
     };
     let independent = 1.0 + (effective - 1.0) / settings.noise_correlation_area;
-    let assumed_variance =
-        scene.noise.deviation().max(1e-3).powi(2) / independent + settings.noise_floor.powi(2);
-    Some(Sight { camera, pixel, deviation: noise.hypot(model_error), assumed_variance })
+    let claimed = scene.noise().deviation().max(LEAST_CLAIM).powi(2);
+    let assumed_variance = claimed.max(fit.residual) / independent + settings.noise_floor.powi(2);
+    Some(Sight { camera, pixel: fit.target, deviation: noise.hypot(model_error), assumed_variance })
 }
 
 /// Gauss-Newton on all sights at once from the true position, to convergence.
