@@ -16,7 +16,10 @@ mod row;
 mod metrics;
 mod motion;
 
-use motion::{footprints as motion_footprints, lift as motion_lift};
+use motion::{
+    footprints as motion_footprints, lift as motion_lift, partial as motion_partial,
+    population as motion_population,
+};
 
 /// A test for every sweep, and the list of them.
 macro_rules! sweeps {
@@ -34,4 +37,4 @@ macro_rules! sweeps {
 }
 
 // In the order of a training step.
-sweeps! { motion_footprints, motion_lift, metrics }
+sweeps! { motion_footprints, motion_lift, motion_partial, motion_population, metrics }

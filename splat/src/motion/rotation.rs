@@ -132,8 +132,9 @@ impl System {
         for member in members {
             let lever = turn * member.offset;
             let residual = member.translation - motion.translation - (lever - member.offset);
-            let tolerance = body_strain * (member.offset.length() + 0.1 * spacing).max(f64::MIN_POSITIVE);
-            let misfit = residual.length_squared() / (tolerance * tolerance);
+            let tolerance = body_strain * (member.offset.length() + 0.1 * spacing);
+            // Members that all have the centre's mean tolerate nothing, and need not.
+            let misfit = residual.length_squared() / (tolerance * tolerance).max(f64::MIN_POSITIVE);
             let weight = member.affinity / (1.0 + misfit).powi(2);
             let information = member.information * weight;
             let coupling = system.add_rotation(lever, information, residual, weight);

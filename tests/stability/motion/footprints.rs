@@ -97,7 +97,8 @@ fn parameters() -> Vec<Row> {
 fn noises() -> Vec<Row> {
     let noisy = |extreme: &'static str, deviation: f64, cell: u32| {
         row(extreme, move |seed| {
-            Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed).with_noise(deviation, cell, seed)
+            Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed)
+                .with_noise(deviation, cell, seed)
         })
     };
     vec![

@@ -20,7 +20,15 @@ pub(super) fn body(rig: Rig, count: usize, seed: u64) -> Scene {
     let gaussians = discs(&mut random, count, rig.target, radius, rig.length_of(0.6));
     let degrees = random.random_range(1.0..20.0);
     let motion = Rigid::random(&mut random, rig.target, degrees, radius);
-    Scene { gaussians, cameras: rig.cameras(), motion, noise: Noise::Independent(0.0), outliers: 0.0, seed }
+    Scene {
+        gaussians,
+        cameras: rig.cameras(),
+        motion,
+        noise: Noise::Independent(0.0),
+        outliers: 0.0,
+        stray: None,
+        seed,
+    }
 }
 
 /// A row for lone Gaussians and one for bodies, over the scenes that `alter` makes of the usual one.

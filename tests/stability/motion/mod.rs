@@ -3,6 +3,8 @@
 pub(crate) mod footprints;
 mod judge;
 pub(crate) mod lift;
+pub(crate) mod partial;
+pub(crate) mod population;
 mod prescribed;
 mod reference;
 mod scene;

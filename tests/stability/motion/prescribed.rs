@@ -71,7 +71,17 @@ pub(super) struct Scene {
     pub noise: Noise,
     /// Share of the views of each Gaussian whose track leads anywhere.
     pub outliers: f64,
+    pub stray: Option<Stray>,
     pub seed: u64,
+}
+
+/// A Gaussian of the body that goes its own way, and that only the first views see.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Stray {
+    pub mean: DVec3,
+    /// What it moves beyond the body.
+    pub shift: DVec3,
+    pub views: usize,
 }
 
 impl Scene {
@@ -90,7 +100,6 @@ impl Scene {
             .map(|camera| MotionView { camera: camera.clone(), tracks: Arc::clone(&tracks) })
             .collect()
     }
-
 }
 
 impl Tracked for Scene {
@@ -123,6 +132,19 @@ impl Tracked for Scene {
     }
 }
 
+impl Scene {
+    /// The motion of the Gaussian at `mean`, and whether the camera sees it at all.
+    fn motion_of(&self, mean: DVec3, camera: &Camera) -> (Rigid, bool) {
+        match self.stray {
+            Some(stray) if stray.mean == mean => {
+                let shift = self.motion.shift + stray.shift;
+                (Rigid { shift, ..self.motion }, self.cameras[..stray.views].contains(camera))
+            }
+            _ => (self.motion, true),
+        }
+    }
+}
+
 /// Points on the disc of a Gaussian. Depends on the Gaussian and the view by their values alone, so that an order of
 /// the Gaussians other than the scene's makes no difference.
 fn sampled(
@@ -133,15 +155,17 @@ fn sampled(
     is_noisy: bool,
 ) -> Vec<Sample> {
     let mean = gaussians.mean(index);
-    let Some(moved) = camera.project_world(mean).and(Some(camera.project_world(scene.motion.of(mean)))) else {
+    let (motion, is_seen) = scene.motion_of(mean, camera);
+    if camera.project_world(mean).is_none() {
         return Vec::new();
-    };
+    }
     let mut random = random(hash(scene.seed, mean, camera));
     let mut pair = || DVec2::new(normal(&mut random), normal(&mut random));
     let size = DVec2::new(camera.width.into(), camera.height.into());
     let (anywhere, alike) = (pair() * size, pair());
     let is_lost = is_noisy && scene.has_outlier(mean, camera);
-    let lost = (anywhere.rem_euclid(size) - moved.unwrap_or_default()) * f64::from(u8::from(is_lost));
+    let lost = (anywhere.rem_euclid(size) - camera.project_world(motion.of(mean)).unwrap_or_default())
+        * f64::from(u8::from(is_lost));
     let [wide, high] = major_axes(gaussians, index);
     let step = 2.0 * REACH / f64::from(SIDE - 1);
     let grid = (0..SIDE * SIDE)
@@ -155,12 +179,12 @@ fn sampled(
                 Noise::Alike(deviation) => alike * deviation,
             };
             let from = camera.project_world(point);
-            let to = camera.project_world(scene.motion.of(point)).map(|exact| exact + lost + error);
+            let to = camera.project_world(motion.of(point)).map(|exact| exact + lost + error);
             Sample {
                 weight: (-0.5 * at.length_squared()).exp(),
                 from: from.unwrap_or_default(),
                 to: to.unwrap_or_default(),
-                is_visible: to.is_some_and(|to| camera.contains(to)) && from.is_some(),
+                is_visible: is_seen && to.is_some_and(|to| camera.contains(to)) && from.is_some(),
             }
         })
         .collect();

@@ -70,11 +70,7 @@ fn affine(samples: &[Sample], mean: DVec2) -> Affine {
 }
 
 /// What the right views say about Gaussian `index`.
-pub(super) fn sights<'a>(
-    scene: &'a impl Tracked,
-    index: usize,
-    settings: &MotionSettings,
-) -> Vec<Sight<'a>> {
+pub(super) fn sights<'a>(scene: &'a impl Tracked, index: usize, settings: &MotionSettings) -> Vec<Sight<'a>> {
     let mean = scene.gaussians().mean(index);
     let right = scene.cameras().iter().filter(|camera| !scene.has_outlier(mean, camera));
     right.filter_map(|camera| sight(scene, index, camera, settings)).collect()
@@ -104,7 +100,8 @@ fn sight<'a>(
     let noiseless = affine(&visible(scene.samples(index, camera, false)), projected);
     let centroid = seen.iter().map(|s| s.from * s.weight).sum::<DVec2>() / weight(&seen);
     // A fit may as well take the centroid's motion for the mean's.
-    let model_error = (noiseless.target - exact).length() + (centroid - projected).length() * noiseless.strain;
+    let model_error =
+        (noiseless.target - exact).length() + (centroid - projected).length() * noiseless.strain;
     let effective = weight(&seen).powi(2) / seen.iter().map(|s| s.weight * s.weight).sum::<f64>();
     let noise = match scene.noise() {
         Noise::Independent(deviation) => deviation / effective.sqrt(),

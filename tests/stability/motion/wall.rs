@@ -69,7 +69,8 @@ impl Wall {
             let cells = columns * (HEIGHT.div_ceil(cell) + 1);
             // Cells begin anywhere.
             let first = [random.random_range(0..cell), random.random_range(0..cell)];
-            let errors: Vec<[f64; 2]> = (0..cells).map(|_| [normal(&mut random), normal(&mut random)]).collect();
+            let errors: Vec<[f64; 2]> =
+                (0..cells).map(|_| [normal(&mut random), normal(&mut random)]).collect();
             tracks.sigma.fill(deviation.max(LEAST_CLAIM) as f32);
             for (pixel, position) in tracks.positions.iter_mut().enumerate() {
                 let (column, row) = (pixel as u32 % WIDTH + first[0], pixel as u32 / WIDTH + first[1]);
