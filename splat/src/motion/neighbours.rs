@@ -64,19 +64,45 @@ impl Neighbourhood {
         Ok(Self { nearest, spacing })
     }
 
-    /// The ties in both directions: with every tie its reverse, each list in index order.
-    pub(super) fn symmetric(&self) -> Vec<Vec<Neighbour>> {
-        let mut both = self.nearest.clone();
-        for (from, list) in self.nearest.iter().enumerate() {
-            for neighbour in list {
-                both[neighbour.index].push(Neighbour { index: from, ..*neighbour });
-            }
+    /// Who counts a Gaussian among its nearest without being among the Gaussian's own.
+    pub(super) fn incoming(&self) -> Incoming {
+        let is_mutual = |from: usize, to: usize| self.nearest[to].iter().any(|back| back.index == from);
+        let one_way: Vec<(usize, Neighbour)> = (0..self.nearest.len())
+            .into_par_iter()
+            .flat_map_iter(|from| {
+                let ties = self.nearest[from].iter().filter(move |tie| !is_mutual(from, tie.index));
+                ties.map(move |tie| (tie.index, Neighbour { index: from, ..*tie }))
+            })
+            .collect();
+        let mut starts = vec![0; self.nearest.len() + 1];
+        for &(to, _) in &one_way {
+            starts[to + 1] += 1;
         }
-        both.par_iter_mut().for_each(|list| {
-            list.sort_by_key(|neighbour| neighbour.index);
-            list.dedup_by_key(|neighbour| neighbour.index);
-        });
-        both
+        for index in 1..starts.len() {
+            starts[index] += starts[index - 1];
+        }
+        let mut next = starts.clone();
+        let nobody = Neighbour { index: 0, distance: 0.0, affinity: 0.0 };
+        let mut ties = vec![nobody; one_way.len()];
+        for (to, tie) in one_way {
+            ties[next[to]] = tie;
+            next[to] += 1;
+        }
+        Incoming { starts, ties }
+    }
+}
+
+/// One-way ties by the Gaussian that they lead to.
+pub(super) struct Incoming {
+    /// Where the ties to each Gaussian begin in `ties`, and one past the last of all.
+    starts: Vec<usize>,
+    ties: Vec<Neighbour>,
+}
+
+impl Incoming {
+    /// The ties to a Gaussian, those from the first Gaussians first.
+    pub(super) fn to(&self, index: usize) -> &[Neighbour] {
+        &self.ties[self.starts[index]..self.starts[index + 1]]
     }
 }
 

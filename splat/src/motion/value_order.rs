@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::{MotionField, MotionOrigin};
 use crate::gaussians::Gaussians;
 
-/// Gaussians sorted by their values.
+/// Gaussians sorted by their values, neighbours near each other.
 ///
 /// Floating-point sums, nearest neighbours at equal distances and blending at equal depths all depend on the
 /// order of the Gaussians. In this one they do not depend on the order in which the Gaussians came: permuted
@@ -22,14 +22,22 @@ pub(super) struct ValueOrder {
 
 impl ValueOrder {
     pub(super) fn of(gaussians: &Gaussians) -> Self {
-        let mut order: Vec<usize> = (0..gaussians.len()).collect();
-        order.par_sort_unstable_by(|&a, &b| compare(gaussians, a, b).then(a.cmp(&b)));
-        let mut representative: Vec<usize> = Vec::with_capacity(order.len());
-        for (place, &index) in order.iter().enumerate() {
-            let is_same = place > 0 && compare(gaussians, order[place - 1], index).is_eq();
+        let mut keys: Vec<(u128, usize)> = (0..gaussians.len())
+            .into_par_iter()
+            .map(|index| (curve(gaussians.means[index]), index))
+            .collect();
+        keys.par_sort_unstable_by(|a, b| {
+            a.0.cmp(&b.0).then_with(|| compare_rest(gaussians, a.1, b.1)).then(a.1.cmp(&b.1))
+        });
+        let mut representative: Vec<usize> = Vec::with_capacity(keys.len());
+        for (place, key) in keys.iter().enumerate() {
+            let is_same = place > 0 && {
+                let before = keys[place - 1];
+                before.0 == key.0 && compare_rest(gaussians, before.1, key.1).is_eq()
+            };
             representative.push(if is_same { representative[place - 1] } else { place });
         }
-        Self { order, representative }
+        Self { order: keys.into_iter().map(|(_, index)| index).collect(), representative }
     }
 
     /// The Gaussians in this order, without the part of their colour that depends on the direction of view:
@@ -71,10 +79,17 @@ fn colour(gaussians: &Gaussians, index: usize) -> [f32; 3] {
     [sh[0], sh[1], sh[2]]
 }
 
-/// By mean first, so that equal means are next to each other.
-fn compare(gaussians: &Gaussians, a: usize, b: usize) -> Ordering {
-    lexical(&gaussians.means[a], &gaussians.means[b])
-        .then_with(|| lexical(&gaussians.log_scales[a], &gaussians.log_scales[b]))
+/// Place of a mean along Morton's curve through the cube of all single-precision numbers: what is near in space
+/// is near in memory, and equal means have equal places.
+fn curve(mean: [f32; 3]) -> u128 {
+    // In the order of the numbers: a set sign bit reverses the others.
+    let ordered = mean.map(|c| if c.is_sign_negative() { !c.to_bits() } else { c.to_bits() | 1 << 31 });
+    (0..32).rev().flat_map(|bit| ordered.map(|c| c >> bit & 1)).fold(0, |key, bit| key << 1 | u128::from(bit))
+}
+
+/// By everything but the mean.
+fn compare_rest(gaussians: &Gaussians, a: usize, b: usize) -> Ordering {
+    lexical(&gaussians.log_scales[a], &gaussians.log_scales[b])
         .then_with(|| lexical(&gaussians.rotations[a], &gaussians.rotations[b]))
         .then_with(|| gaussians.logit_opacities[a].total_cmp(&gaussians.logit_opacities[b]))
         .then_with(|| lexical(&colour(gaussians, a), &colour(gaussians, b)))
