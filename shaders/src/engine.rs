@@ -8,7 +8,7 @@ use splat::{
     engine::{Engine, EngineError, Rendering, Session, SessionInput, check_size},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
-    motion::moments::FootprintMoments,
+    motion::{moments::FootprintMoments, reweighting::Reweighting},
     tracking::TrackField,
 };
 
@@ -167,6 +167,7 @@ impl Engine for GpuEngine {
         _gaussians: &Gaussians,
         _camera: &Camera,
         _tracks: &TrackField,
+        _reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         Err(EngineError::InvalidInput(
             "the GPU engine does not measure footprints; use the CPU engine for motion".to_owned(),

@@ -17,12 +17,18 @@ mod adam;
 mod harmonics;
 mod loss;
 mod metrics;
+mod motion;
 mod raster_backward;
 mod raster_forward;
 mod raster_input;
 mod scenes;
 mod session;
 mod storage;
+
+use motion::{
+    footprints as motion_footprints, lift as motion_lift, partial as motion_partial,
+    population as motion_population,
+};
 
 /// A test for every sweep, and the list of them.
 macro_rules! sweeps {
@@ -40,4 +46,7 @@ macro_rules! sweeps {
 }
 
 // In the order of a training step.
-sweeps! { raster_forward, raster_backward, raster_input, loss, adam, session, harmonics, storage, metrics }
+sweeps! {
+    raster_forward, raster_backward, raster_input, loss, adam, session, harmonics, storage, metrics,
+    motion_footprints, motion_lift, motion_partial, motion_population,
+}

@@ -10,6 +10,10 @@ const STEPS: usize = 8;
 /// Residual, in standard deviations, from which a view's pull stops growing (95 % efficient for normal
 /// noise).
 const HUBER: f64 = 1.345;
+/// Median squared residual of two components of unit variance, `2 ln 2`.
+const MEDIAN_SQUARE: f64 = 2.0 * std::f64::consts::LN_2;
+/// How far the variance of tracks may exceed their claim before their views count as wrong.
+const MOST_EXCESS: f64 = 9.0;
 /// Most pairs of views that are tried as a consistent core.
 const MAX_PAIRS: usize = 66;
 
@@ -60,7 +64,8 @@ pub(super) fn solve(sightings: &[Sighting<'_>], mean: DVec3, settings: &MotionSe
         return None;
     }
     let position = problem.refine_from_rays(&inliers)?;
-    let inliers = problem.inliers(position);
+    let inliers = problem.inliers_by_scale(position);
+    let position = problem.refine_from_rays(&inliers)?;
     (2 * inliers.len() > everyone.len()).then(|| problem.lift(position, inliers)).flatten()
 }
 
@@ -76,14 +81,12 @@ impl Problem<'_> {
         Some(self.refine(start, members))
     }
 
-    /// Precision of the prior that nothing moves farther than its distance from the nearest camera: far below
-    /// that of any track, it only decides directions that no view sees.
+    /// Precision of the prior that nothing moves farther than ten times its distance from the farthest camera:
+    /// far below that of any track, it only decides directions that no view sees. A camera that the mean all but
+    /// touches says nothing about how far things move.
     fn prior_precision(&self, members: &[usize]) -> f64 {
-        let nearest = members
-            .iter()
-            .map(|&m| self.sightings[m].camera.to_camera(self.mean).z)
-            .fold(f64::INFINITY, f64::min);
-        1e-2 / nearest.powi(2).max(f64::MIN_POSITIVE)
+        let depths = members.iter().map(|&m| self.sightings[m].camera.to_camera(self.mean).z);
+        1e-2 / depths.fold(0.0, f64::max).powi(2).max(f64::MIN_POSITIVE)
     }
 
     /// The point closest to the members' viewing rays, in pixels at the depth of the old mean.
@@ -179,6 +182,21 @@ impl Problem<'_> {
 
     fn inliers(&self, position: DVec3) -> Vec<usize> {
         (0..self.sightings.len()).filter(|&m| self.disagreement(position, m) <= 1.0).collect()
+    }
+
+    /// The inliers if the tracks err by as much more than they claim as the median of the views shows: a core
+    /// that agrees by chance would otherwise shut out right views.
+    fn inliers_by_scale(&self, position: DVec3) -> Vec<usize> {
+        let by_noise = |&member: &usize| {
+            let residual = self.residual(position, member)?;
+            Some(residual.length_squared() / self.sightings[member].variance)
+        };
+        let members: Vec<usize> = (0..self.sightings.len()).collect();
+        let mut squares: Vec<f64> = members.iter().filter_map(by_noise).collect();
+        squares.sort_by(f64::total_cmp);
+        let median = squares.get(squares.len() / 2).copied().unwrap_or(0.0);
+        let scale = (median / MEDIAN_SQUARE).clamp(1.0, MOST_EXCESS);
+        members.into_iter().filter(|&m| self.disagreement(position, m) <= scale).collect()
     }
 
     /// The inliers of the pair of views with which the views agree best (truncated squares).

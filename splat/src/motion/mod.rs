@@ -13,9 +13,10 @@
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
 //! | the released code's own path, to compare with | `reference` |
+//! | an order that the input's order does not change | `value_order` |
 //!
-//! Solves run in double precision; sums are in index order, so that the result does not depend on the number
-//! of threads.
+//! Solves run in double precision; sums are in the order of the Gaussians' values, so that the result depends
+//! neither on the number of threads nor on the order of the Gaussians.
 
 mod apply;
 mod fit2d;
@@ -35,6 +36,7 @@ mod static_test;
 mod strain;
 #[cfg(test)]
 mod tests;
+mod value_order;
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -54,6 +56,7 @@ use neighbours::Neighbourhood;
 use observe::Observation;
 use propagate::{Context, State};
 use rotation::{Deformation, Member};
+use value_order::ValueOrder;
 
 /// How a Gaussian's motion was found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -116,6 +119,8 @@ pub enum MotionStage {
 
 /// Motion of every Gaussian of the static model to the frame that the tracks lead to.
 ///
+/// Depends on the Gaussians' values, not on their order; equal Gaussians move alike.
+///
 /// # Errors
 /// [`EngineError::InvalidInput`] if tracks and camera of a view differ in size; otherwise whatever the engine
 /// reports.
@@ -142,6 +147,18 @@ pub fn estimate_staged(
     if settings.lift == LiftMethod::Reference {
         return reference::estimate(engine, gaussians, views);
     }
+    let order = ValueOrder::of(gaussians);
+    let field = estimate_in_order(engine, &order.sorted(gaussians), views, settings, entered)?;
+    Ok(order.restored(field))
+}
+
+fn estimate_in_order(
+    engine: &dyn Engine,
+    gaussians: &Gaussians,
+    views: &[MotionView],
+    settings: &MotionSettings,
+    entered: &mut dyn FnMut(MotionStage),
+) -> Result<MotionField, EngineError> {
     entered(MotionStage::Observe);
     let observations = observe::observe(engine, gaussians, views, settings)?;
     entered(MotionStage::Neighbours);

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::{
     MotionOrigin, MotionSettings,
     lift::Lift,
+    linear::solve,
     neighbours::{Neighbour, Neighbourhood},
     rotation::{Member, RigidMotion, fit_rigid_motion},
 };
@@ -45,6 +46,12 @@ impl Context<'_> {
     fn indirect_information(&self) -> DMat3 {
         let deviation = self.settings.neighbour_strain * self.neighbourhood.spacing;
         DMat3::from_diagonal(DVec3::splat(deviation.max(1e-150).powi(-2)))
+    }
+
+    /// Standard deviation of a motion that is taken from these neighbours.
+    fn prediction_deviation(&self, members: &[Neighbour]) -> f64 {
+        let distance = members.iter().map(|n| n.distance).sum::<f64>() / members.len().max(1) as f64;
+        self.settings.neighbour_strain * (distance + 0.1 * self.neighbourhood.spacing)
     }
 
     pub(super) fn member(
@@ -168,12 +175,11 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
         return None;
     }
     let are_at_rest = consensus.members.iter().all(|n| states[n.index].origin == MotionOrigin::Static);
-    let own = states[index].own.clone().filter(|own| agrees(own, consensus.translation, context.settings));
     if are_at_rest && states[index].own.is_none() {
         return Some(State::unmoved(MotionOrigin::Static, None));
     }
     let indirect = context.indirect_information();
-    let mut members: Vec<Member> = consensus
+    let members: Vec<Member> = consensus
         .members
         .iter()
         .map(|n| {
@@ -183,27 +189,35 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
             context.member(index, n.index, n.affinity, state, information)
         })
         .collect();
-    members.extend(own.as_ref().map(|own| Member {
-        offset: DVec3::ZERO,
-        translation: own.translation,
-        information: own.information,
-        affinity: 1.0,
-    }));
-    let RigidMotion { translation, rotation } = fit_rigid_motion(
+    let RigidMotion { mut translation, rotation } = fit_rigid_motion(
         &members,
         &[],
         consensus.translation,
         context.neighbourhood.spacing,
         context.settings,
     );
+    let deviation = context.prediction_deviation(&consensus.members);
+    let seen =
+        states[index].own.as_ref().map(|own| (own, pull(own, translation, deviation, context.settings)));
+    let own = match seen {
+        Some((own, Some(pull))) => {
+            translation += pull;
+            Some(own.clone())
+        }
+        _ => None,
+    };
     Some(State { origin: MotionOrigin::Propagated, translation, rotation, own })
 }
 
-/// Whether the seen directions of a position agree with a translation taken from neighbours.
-fn agrees(own: &Lift, translation: DVec3, settings: &MotionSettings) -> bool {
-    let difference = translation - own.translation;
-    // The neighbours' own error is a strain; a factor of two in deviations leaves room for it.
-    let limit = 2.0 * settings.outlier_significance;
-    let rest = difference.dot(own.information * difference);
-    rest <= limit * limit
+/// How far what a Gaussian's own views see moves it from its neighbours' prediction, whose standard deviation is
+/// given: all the way along the directions that they see, not at all along the others. `None` if both contradict
+/// each other.
+fn pull(own: &Lift, prediction: DVec3, deviation: f64, settings: &MotionSettings) -> Option<DVec3> {
+    let difference = own.translation - prediction;
+    let prior = deviation * deviation;
+    // `(H⁻¹ + τ² I)⁻¹ = H (I + τ² H)⁻¹` needs no inverse of the singular `H`.
+    let solved = solve(DMat3::IDENTITY + own.information * prior, difference)?;
+    let innovation = own.information * solved;
+    let is_plausible = difference.dot(innovation) <= settings.outlier_significance.powi(2);
+    (is_plausible && innovation.is_finite()).then_some(innovation * prior)
 }

@@ -11,6 +11,8 @@ use crate::{cameras::Camera, gaussians::Gaussians};
 
 /// Most Gauss-Newton steps on the rigid motion; a small rotation takes about six, half a turn ten.
 const STEPS: usize = 16;
+/// Last step, radians or spacings, after which no other is taken.
+const CONVERGED: f64 = 1e-5;
 /// Longest step, radians: keeps the linearisation honest.
 const LONGEST_STEP: f64 = 0.7;
 /// Strain at which a neighbour stops counting as part of the same body. The next stage starts when a step
@@ -83,7 +85,7 @@ pub(super) fn fit_rigid_motion(
         motion.translation += translation;
         motion.rotation = (DQuat::from_scaled_axis(turn) * motion.rotation).normalize();
         let is_last_stage = stage + 1 == BODY_STRAIN.len();
-        let has_converged = turn.length() < 1e-8 && translation.length() <= 1e-8 * spacing;
+        let has_converged = turn.length() < CONVERGED && translation.length() <= CONVERGED * spacing;
         if turn.length() < SETTLED && !is_last_stage {
             stage += 1;
         }
@@ -132,8 +134,9 @@ impl System {
         for member in members {
             let lever = turn * member.offset;
             let residual = member.translation - motion.translation - (lever - member.offset);
-            let tolerance = body_strain * (member.offset.length() + 0.1 * spacing).max(f64::MIN_POSITIVE);
-            let misfit = residual.length_squared() / (tolerance * tolerance);
+            let tolerance = body_strain * (member.offset.length() + 0.1 * spacing);
+            // Members that all have the centre's mean tolerate nothing, and need not.
+            let misfit = residual.length_squared() / (tolerance * tolerance).max(f64::MIN_POSITIVE);
             let weight = member.affinity / (1.0 + misfit).powi(2);
             let information = member.information * weight;
             let coupling = system.add_rotation(lever, information, residual, weight);
@@ -149,6 +152,7 @@ impl System {
     }
 
     /// Adds a residual that falls by `δω × lever`; gives the block that couples it to its translation.
+    #[inline(always)]
     fn add_rotation(&mut self, lever: DVec3, information: DMat3, residual: DVec3, weight: f64) -> DMat3 {
         let by_rotation = -cross_matrix(lever);
         let force = information * residual;

@@ -151,7 +151,8 @@ fn sights(
 ) -> Result<Vec<Vec<Sight>>, EngineError> {
     let mut sights = vec![Vec::new(); gaussians.len()];
     for (view, MotionView { camera, tracks }) in views.iter().enumerate() {
-        let all = engine.footprint_moments(gaussians, camera, &weighted_by_blending(tracks, |_| true), None)?;
+        let all =
+            engine.footprint_moments(gaussians, camera, &weighted_by_blending(tracks, |_| true), None)?;
         let still = fixed::still_pixels(tracks);
         let still = engine.footprint_moments(
             gaussians,

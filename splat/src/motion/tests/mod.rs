@@ -193,9 +193,9 @@ fn permuted_gaussians_give_the_permuted_motion() {
     let permuted = run(&gaussians.select(&order), &noisy);
     for (new, &old) in order.iter().enumerate() {
         assert_eq!(permuted.origin[new], field.origin[old]);
-        // Sums are in index order, so only rounding differs.
-        assert!((permuted.translation[new] - field.translation[old]).length() < 1e-9);
-        assert!(permuted.rotation[new].angle_between(field.rotation[old]) < 1e-6);
+        assert_eq!(permuted.translation[new], field.translation[old]);
+        assert_eq!(permuted.rotation[new], field.rotation[old]);
+        assert_eq!(permuted.information[new], field.information[old]);
     }
 }
 

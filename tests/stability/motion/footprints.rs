@@ -1,0 +1,118 @@
+//! Footprints that the real engine measures: size, aspect ratio, opacity, quaternions, noise and outliers of the
+//! tracks.
+
+use std::f64::consts::TAU;
+
+use glam::{DQuat, DVec3};
+use rand::RngExt;
+use splat::{gaussians::Gaussians, motion::MotionSettings};
+
+use super::{
+    judge::{LIFT, Origins, judge_all},
+    scene::{Rig, random},
+    wall::Wall,
+};
+use crate::row::Row;
+
+/// Lone Gaussians per row.
+const CASES: u64 = 30;
+
+/// The usual rig before a smaller image; a pixel of it is four of the rig's.
+const PIXEL: f64 = 4.0;
+
+/// One Gaussian lying on the wall, given by its standard deviations in pixels.
+fn on_wall(rig: Rig, [wide, high]: [f64; 2], seed: u64) -> Gaussians {
+    let mut random = random(seed);
+    let mut place = || rig.length_of(random.random_range(-15.0..15.0) * PIXEL);
+    let mean = rig.target + DVec3::new(0.0, place(), place());
+    // The third axis along the wall's normal, after a spin about it.
+    let spin = DQuat::from_rotation_x(random.random_range(0.0..TAU));
+    let q = spin * DQuat::from_rotation_arc(DVec3::Z, DVec3::X);
+    let thin = wide.min(high) * 1e-3;
+    Gaussians {
+        means: vec![mean.as_vec3().to_array()],
+        rotations: vec![[q.w, q.x, q.y, q.z].map(|c| c as f32)],
+        log_scales: vec![[wide, high, thin].map(|pixels| rig.length_of(pixels * PIXEL).ln() as f32)],
+        logit_opacities: vec![1.0],
+        sh: vec![0.0; 3],
+        sh_degree: 0,
+    }
+}
+
+fn row(extreme: &'static str, wall: impl Fn(u64) -> Wall) -> Row {
+    let mut row = Row::new("motion: footprint", extreme, LIFT);
+    let mut origins = Origins::default();
+    for seed in 0..CASES {
+        let wall = wall(seed);
+        let field = wall.estimate();
+        judge_all(&mut row, &wall, &field, &MotionSettings::default());
+        origins.add(Origins::of(&field));
+    }
+    row.remark(origins.remark())
+}
+
+fn of_size(extreme: &'static str, size: [f64; 2]) -> Row {
+    row(extreme, |seed| Wall::new(on_wall(Rig::USUAL, size, seed), Rig::USUAL, seed))
+}
+
+fn altered(extreme: &'static str, alter: impl Fn(&mut Gaussians)) -> Row {
+    row(extreme, |seed| {
+        let mut gaussians = on_wall(Rig::USUAL, [3.0, 2.0], seed);
+        alter(&mut gaussians);
+        Wall::new(gaussians, Rig::USUAL, seed)
+    })
+}
+
+fn sizes() -> Vec<Row> {
+    vec![
+        of_size("footprint 0.05 px", [0.05, 0.05]),
+        of_size("footprint 0.5 px", [0.5, 0.5]),
+        of_size("footprint 4 px", [4.0, 4.0]),
+        of_size("footprint 20 px", [20.0, 20.0]),
+        of_size("footprint of the whole image (160 px)", [160.0, 160.0]),
+        of_size("footprint of 100 images (16 000 px)", [16_000.0, 16_000.0]),
+        of_size("aspect ratio 10, 20 px long", [20.0, 2.0]),
+        of_size("aspect ratio 1e3, 20 px long", [20.0, 20e-3]),
+        of_size("aspect ratio 1e6, 20 px long", [20.0, 20e-6]),
+        of_size("aspect ratio 1e6, 20 000 px long", [2e4, 2e-2]),
+    ]
+}
+
+fn parameters() -> Vec<Row> {
+    let opacity = |logit: f32| move |set: &mut Gaussians| set.logit_opacities[0] = logit;
+    let norm = |norm: f32| move |set: &mut Gaussians| set.rotations[0] = set.rotations[0].map(|c| c * norm);
+    vec![
+        altered("opacity 0 (logit -1e30)", opacity(-1e30)),
+        altered("opacity 1/250", opacity(-5.517)),
+        altered("opacity 1 (logit 1e30)", opacity(1e30)),
+        altered("quaternion of norm 1e-20", norm(1e-20)),
+        altered("quaternion of norm 1e20", norm(1e20)),
+        altered("zero quaternion", norm(0.0)),
+        altered("log scale -1e30, 1e30 and infinite", |set| set.log_scales[0] = [f32::INFINITY, 1e30, -1e30]),
+        altered("NaN quaternion", |set| set.rotations[0][2] = f32::NAN),
+        altered("NaN mean", |set| set.means[0][1] = f32::NAN),
+    ]
+}
+
+fn noises() -> Vec<Row> {
+    let noisy = |extreme: &'static str, deviation: f64, cell: u32| {
+        row(extreme, move |seed| {
+            Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed)
+                .with_noise(deviation, cell, seed)
+        })
+    };
+    vec![
+        noisy("independent noise 0.1 px", 0.1, 1),
+        noisy("independent noise 1 px", 1.0, 1),
+        noisy("independent noise 5 px", 5.0, 1),
+        noisy("noise 0.1 px, alike over 4 px", 0.1, 4),
+        noisy("noise 1 px, alike over 4 px", 1.0, 4),
+        noisy("noise 1 px, alike over 32 px", 1.0, 32),
+        noisy("noise 5 px, alike over 4 px", 5.0, 4),
+    ]
+}
+
+/// Every row of this sweep.
+pub(crate) fn rows() -> Vec<Row> {
+    [sizes(), parameters(), noises()].concat()
+}
