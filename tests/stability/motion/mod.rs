@@ -6,6 +6,8 @@ pub(crate) mod lift;
 pub(crate) mod partial;
 pub(crate) mod population;
 mod prescribed;
+#[cfg(test)]
+mod properties;
 mod reference;
 mod scene;
 mod wall;
