@@ -73,7 +73,7 @@ fn moments_without_noise_have_the_motion_of_the_surface_and_noise_has_its_deviat
     for noise in [0.0, 0.1] {
         let engine = NoisyFits::new(&set, &camera, Motion::Bend, noise, 3).unwrap();
         let tracks = engine.tracks().next().unwrap();
-        let moments = engine.footprint_moments(&set, &camera[0], &tracks).unwrap();
+        let moments = engine.footprint_moments(&set, &camera[0], &tracks, None).unwrap();
         let (mut squares, mut shifts) = (0.0, 0.0);
         for (index, m) in moments.iter().enumerate() {
             let [uu, uv, vv] = m.source;

@@ -1,6 +1,6 @@
 //! An engine without images: its footprints have exact affine motions, plus noise on each.
 
-use std::f64::consts::PI;
+use std::{collections::HashMap, f64::consts::PI};
 
 use anyhow::{Context, Result};
 use glam::{DMat2, DMat3, DVec2, DVec3};
@@ -10,7 +10,7 @@ use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::Gaussians,
-    motion::{MotionSettings, moments::FootprintMoments},
+    motion::{MotionSettings, moments::FootprintMoments, reweighting::Reweighting},
     tracking::TrackField,
 };
 
@@ -30,6 +30,8 @@ const ALPHA_LEVELS: f64 = 255.0;
 /// plane. Nothing hides anything.
 pub(crate) struct NoisyFits {
     views: Vec<FittedView>,
+    /// Index of each Gaussian by the bits of its mean: motion compensation orders Gaussians as it likes.
+    index_of: HashMap<[u32; 3], usize>,
 }
 
 struct FittedView {
@@ -70,7 +72,9 @@ impl NoisyFits {
                 sigmas.get(sigmas.len() / 2).map_or(EXACT_SIGMA, |sigma| sigma.max(EXACT_SIGMA)) as f32;
             views.push(view);
         }
-        Ok(Self { views })
+        let bits = |mean: &[f32; 3]| mean.map(f32::to_bits);
+        let index_of = gaussians.means.iter().enumerate().map(|(index, mean)| (bits(mean), index)).collect();
+        Ok(Self { views, index_of })
     }
 
     /// Fields to hand over with the cameras: they claim the right noise; their positions only say that nothing rests.
@@ -147,6 +151,7 @@ impl Footprint {
         let unexplained = 2.0 * self.pixel_sigma(noise).powi(2);
         FootprintMoments {
             blend_weight: weight,
+            visible: weight,
             weight,
             weight_squared: 0.5 * opacity * weight,
             pixels: (area * (ALPHA_LEVELS * opacity).ln().max(0.0)) as u32,
@@ -158,6 +163,7 @@ impl Footprint {
                 .map(|value| weight * value),
             target: weight * (explained.x_axis.x + explained.y_axis.y + unexplained),
             variance: weight,
+            contest: 0.0,
         }
     }
 }
@@ -198,20 +204,24 @@ impl Engine for NoisyFits {
 
     fn footprint_moments(
         &self,
-        _: &Gaussians,
+        gaussians: &Gaussians,
         camera: &Camera,
         tracks: &TrackField,
+        _: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         let Some(view) = self.views.iter().find(|view| view.camera == *camera) else {
             return Err(EngineError::InvalidInput("a camera that was not prepared".into()));
         };
-        let of = |(moments, &centre): (&FootprintMoments, &usize)| {
+        let of = |mean: &[f32; 3]| {
+            let index = self.index_of.get(&mean.map(f32::to_bits));
+            let index = *index.ok_or_else(|| EngineError::InvalidInput("an unknown Gaussian".into()))?;
+            let (moments, centre) = (&view.moments[index], view.centres[index]);
             if tracks.visible[centre] {
-                return reweighted(moments, f64::from(tracks.sigma[centre]).powi(2));
+                return Ok(reweighted(moments, f64::from(tracks.sigma[centre]).powi(2)));
             }
-            FootprintMoments { blend_weight: moments.blend_weight, ..FootprintMoments::default() }
+            Ok(FootprintMoments { blend_weight: moments.blend_weight, ..FootprintMoments::default() })
         };
-        Ok(view.moments.iter().zip(&view.centres).map(of).collect())
+        gaussians.means.iter().map(of).collect()
     }
 
     fn session(&self, _: SessionInput) -> Result<Box<dyn Session>, EngineError> {
