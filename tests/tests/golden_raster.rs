@@ -111,7 +111,8 @@ fn footprint_moments_match_on_every_track_field() {
             visible: vec![true; camera.width as usize * camera.height as usize],
             sigma: vec![1.0; camera.width as usize * camera.height as usize],
         };
-        let moments = CpuEngine::default().footprint_moments(&golden.gaussians(), &camera, &tracks, None).unwrap();
+        let moments =
+            CpuEngine::default().footprint_moments(&golden.gaussians(), &camera, &tracks, None).unwrap();
         let golden_pixels = golden.values("pixel_count");
         for (index, found) in moments.iter().enumerate() {
             assert_eq!(f64::from(found.pixels), golden_pixels[index], "{field}: pixels of Gaussian {index}");
