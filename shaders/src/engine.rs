@@ -13,7 +13,7 @@ use splat::{
 };
 
 use crate::{
-    buffers::{Buffers, GradientBuffers, Size, admit, first_capacity, separated},
+    buffers::{Buffers, GradientBuffers, Size, admit, allocate, first_capacity, separated, storage},
     device::GpuDevice,
     kernels::Kernels,
     layout::{GEOMETRY, State, Step, View},
@@ -47,6 +47,28 @@ impl GpuEngine {
     /// The device.
     pub fn device(&self) -> &GpuDevice {
         &self.context.device
+    }
+
+    /// A rendering as 8-bit RGB, `H × W × 3`, values rounded and clamped to `[0, 1]`: a fifth of the bytes to read back.
+    pub fn render_rgb8(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+    ) -> Result<Vec<u8>, EngineError> {
+        check_size(camera)?;
+        let Context { device, kernels } = &*self.context;
+        let view = ViewBuffer::new(device, View::new(camera, background))?;
+        let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, false)?)?;
+        let pixels = view.data.pixels();
+        let [bytes] = allocate(device, [storage("8-bit image", 12 * pixels.div_ceil(4))])?;
+        let mut encoder = device.device.create_command_encoder(&Default::default());
+        record(&mut encoder, "quantize", [&Binder { device, kernels }.quantize(&buffers, &bytes, &view)]);
+        device.queue.submit([encoder.finish()]);
+        let words: Vec<[u8; 12]> = read(device, &bytes, pixels.div_ceil(4) as usize)?;
+        let mut image = words.into_flattened();
+        image.truncate(3 * pixels as usize);
+        Ok(image)
     }
 
     /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is

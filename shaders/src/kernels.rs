@@ -24,6 +24,7 @@ pub(crate) const SOURCES: &[(&str, &str)] = &[
     ("blend", composed!("blend")),
     ("blend_backward", composed!("blend_backward")),
     ("project_backward", composed!("project_backward")),
+    ("quantize", composed!("quantize")),
     ("loss", composed!("loss")),
     ("adam", composed!("adam")),
     ("replace", composed!("replace")),
@@ -96,6 +97,7 @@ kernels! {
     "blend": blend;
     "blend_backward": blend_backward;
     "project_backward": project_backward;
+    "quantize": quantize;
     "loss": similarity, loss_gradient, total;
     "adam": adam_geometry, adam_sh;
     "replace": replace;

@@ -31,7 +31,8 @@ pub(crate) struct View {
     pub tiles: [u32; 2],
     pub absolute: f32,
     pub structural: f32,
-    pub padding: [f32; 2],
+    pub is_packed: u32,
+    pub padding: u32,
 }
 
 /// One step.

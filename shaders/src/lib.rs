@@ -24,6 +24,7 @@ mod session;
 mod stages;
 #[cfg(test)]
 mod tests;
+mod wanted;
 
 pub use device::{DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, devices};
 pub use engine::GpuEngine;

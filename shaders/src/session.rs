@@ -25,6 +25,7 @@ use crate::{
     program::{Dispatch, record},
     readback::read,
     stages::{Binder, ViewBuffer},
+    wanted::{WantedImage, is_eight_bits},
 };
 
 /// Steps that may be submitted before their losses are looked at.
@@ -34,10 +35,10 @@ const REMEMBERED: usize = 256;
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 
-struct SessionView {
-    view: ViewBuffer,
-    /// Colour, and whether the pixel counts.
-    wanted: Buffer,
+pub(crate) struct SessionView {
+    pub view: ViewBuffer,
+    /// See [`WantedImage`].
+    pub wanted: Buffer,
     /// The whole step.
     program: Vec<Dispatch>,
 }
@@ -85,9 +86,11 @@ impl GpuSession {
             has_gradient: true,
         };
         let active: Vec<bool> = input.frozen.iter().map(|frozen| !frozen).collect();
-        let pixels = images().map(|view| view.pixels());
+        let pixels =
+            input.views.iter().map(|view| (view.image.pixel_count() as u64, is_eight_bits(&view.image)));
         admit(device, &training_requests(&size, pixels, active.len(), REMEMBERED))?;
-        let views = input.views.iter().map(|view| session_view(device, view, &input));
+        let (background, weight) = (input.background, input.dssim_weight);
+        let views = input.views.iter().map(|view| session_view(device, view, background, weight));
         let mut session = Self {
             views: views.collect::<Result<_, _>>()?,
             buffers: Buffers::new(device, gaussians, &size)?,
@@ -108,7 +111,8 @@ impl GpuSession {
 
     /// All buffers of a session of this size.
     fn requests(&self, size: &Size, active: usize) -> Vec<Request> {
-        let pixels = self.views.iter().map(|view| view.view.data.pixels());
+        let views = self.views.iter().map(|view| &view.view.data);
+        let pixels = views.map(|view| (view.pixels(), view.is_packed == 1));
         training_requests(size, pixels, active, REMEMBERED)
     }
 
@@ -216,27 +220,22 @@ impl GpuSession {
 }
 
 /// The uniform and the image of a training view.
-fn session_view(
+pub(crate) fn session_view(
     device: &GpuDevice,
     training: &TrainingView,
-    input: &SessionInput,
+    background: [f32; 3],
+    dssim_weight: f32,
 ) -> Result<SessionView, EngineError> {
-    let counts = |pixel: usize| training.mask.as_ref().is_none_or(|mask| mask.inside[pixel]);
-    let pixels = training.image.pixels.as_chunks::<3>().0;
-    let wanted: Vec<[f32; 4]> = pixels
-        .iter()
-        .enumerate()
-        .map(|(pixel, [red, green, blue])| [*red, *green, *blue, f32::from(u8::from(counts(pixel)))])
-        .collect();
-    let counted = (0..pixels.len()).filter(|&pixel| counts(pixel)).count();
-    let mut view = View::new(&training.camera, input.background);
-    if counted > 0 {
-        let values = 3.0 * counted as f32;
-        view.absolute = (1.0 - input.dssim_weight) / values;
-        view.structural = input.dssim_weight / values;
+    let wanted = WantedImage::new(training);
+    let mut view = View::new(&training.camera, background);
+    if wanted.counted > 0 {
+        let values = 3.0 * wanted.counted as f32;
+        view.absolute = (1.0 - dssim_weight) / values;
+        view.structural = dssim_weight / values;
     }
-    let [buffer] = allocate(device, [training_image(view.pixels())])?;
-    device.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&wanted));
+    view.is_packed = wanted.is_packed.into();
+    let [buffer] = allocate(device, [training_image(view.pixels(), wanted.is_packed)])?;
+    device.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&wanted.words));
     Ok(SessionView { view: ViewBuffer::new(device, view)?, wanted: buffer, program: Vec::new() })
 }
 

@@ -59,6 +59,13 @@ impl Binder<'_> {
         program
     }
 
+    /// What is rendered as 8-bit RGB.
+    pub(crate) fn quantize(&self, buffers: &Buffers, bytes: &Buffer, view: &ViewBuffer) -> Dispatch {
+        let resources = [(0, whole(&view.buffer)), (1, whole(&buffers.images.rendered)), (2, whole(bytes))];
+        let groups = Groups::threads(view.data.pixels().div_ceil(4));
+        self.dispatch(&self.kernels.quantize, groups, &resources)
+    }
+
     /// Stages 4 and 5.
     pub(crate) fn backward(
         &self,

@@ -17,7 +17,6 @@
 #import footprint::{alphas_of, whiten_column}
 
 @group(0) @binding(0) var<uniform> view: View;
-// After an overflow all lists are empty.
 @group(0) @binding(2) var<storage, read> bounds: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read> slots: array<u32>;
 @group(0) @binding(4) var<storage, read> owners: array<u32>;
@@ -86,7 +85,8 @@ fn blend_backward(
     }
     workgroupBarrier();
     atomicMax(&deepest, max(max(place_of_last.x, place_of_last.y), max(place_of_last.z, place_of_last.w)));
-    let depth = workgroupUniformLoad(&deepest);
+    // After an overflow the lists are empty, while the pixels still have what they had before.
+    let depth = min(workgroupUniformLoad(&deepest), range.y - range.x);
 
     for (var place = range.x + depth + thread; place < range.y; place += THREADS) {
         for (var k = 0u; k < SUMS; k++) {

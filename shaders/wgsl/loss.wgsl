@@ -9,7 +9,7 @@
 @group(0) @binding(2) var<storage, read> state: State;
 @group(0) @binding(3) var<storage, read> rendered: array<vec4<f32>>;
 // Colour, and whether the pixel counts.
-@group(0) @binding(4) var<storage, read> wanted: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> wanted: array<u32>;
 // Per channel the derivatives by windowed mean, square and product, a plane each.
 @group(0) @binding(5) var<storage, read_write> derivatives: array<f32>;
 @group(0) @binding(6) var<storage, read_write> image_gradient: array<vec4<f32>>;
@@ -25,6 +25,14 @@ const THREADS: u32 = 256u;
 const RADIUS: u32 = 5u;
 // A tile with its margins, and a row of it after the horizontal blur.
 const WIDE: u32 = 26u;
+
+fn wanted_pixel(at: u32) -> vec4<f32> {
+    if view.is_packed != 0u {
+        return unpack4x8unorm(wanted[at]);
+    }
+    let first = 4u * at;
+    return bitcast<vec4<f32>>(vec4(wanted[first], wanted[first + 1u], wanted[first + 2u], wanted[first + 3u]));
+}
 
 // Normalised Gaussian of standard deviation 1.5 at the integers from -5 to 0.
 fn tap(distance: u32) -> f32 {
@@ -99,7 +107,7 @@ fn similarity(
     let at = pixel.y * view.size.x + pixel.x;
     var weight = 0.0;
     if is_inside {
-        weight = wanted[at].w;
+        weight = wanted_pixel(at).w;
     }
     var dissimilarity = 0.0;
     for (var channel = 0u; channel < 3u; channel++) {
@@ -110,7 +118,7 @@ fn similarity(
             if all(from_pixel < view.size) {
                 let source = from_pixel.y * view.size.x + from_pixel.x;
                 x = rendered[source][channel];
-                y = wanted[source][channel];
+                y = wanted_pixel(source)[channel];
             }
             source_x[place] = x;
             source_y[place] = y;
@@ -201,8 +209,9 @@ fn loss_gradient(
                 sums += w * blurred_first[thread + i * TILE].xyz;
             }
             let x = rendered[at][channel];
-            let y = wanted[at][channel];
-            let weight = wanted[at].w;
+            let goal = wanted_pixel(at);
+            let y = goal[channel];
+            let weight = goal.w;
             let side = select(0.0, 1.0, x > y) - select(0.0, 1.0, x < y);
             let structural = sums.x + 2.0 * x * sums.y + y * sums.z;
             gradient[channel] = view.absolute * weight * side - view.structural * structural;

@@ -6,11 +6,12 @@ use wgpu::Buffer;
 use super::{Buffers, Request, Size, allocate, storage};
 use crate::{device::GpuDevice, layout::GEOMETRY};
 
-/// Everything that a session takes: `images` are the pixels of each training image, `active` the flags of the Gaussians and
+/// Everything that a session takes: `images` are the pixels of each training image and
+/// whether it is packed, `active` the flags of the Gaussians and
 /// `steps` the losses that the device remembers.
 pub(crate) fn training_requests(
     size: &Size,
-    images: impl Iterator<Item = u64>,
+    images: impl Iterator<Item = (u64, bool)>,
     active: usize,
     steps: usize,
 ) -> Vec<Request> {
@@ -20,12 +21,16 @@ pub(crate) fn training_requests(
         &OptimiserBuffers::requests(size, active),
         &LossBuffers::requests(size, steps),
     ];
-    groups.concat().into_iter().chain(images.map(training_image)).collect()
+    groups
+        .concat()
+        .into_iter()
+        .chain(images.map(|(pixels, is_packed)| training_image(pixels, is_packed)))
+        .collect()
 }
 
 /// Colour of every pixel of a training image, and whether it counts.
-pub(crate) fn training_image(pixels: u64) -> Request {
-    storage("training image", 16 * pixels)
+pub(crate) fn training_image(pixels: u64, is_packed: bool) -> Request {
+    storage("training image", if is_packed { 4 * pixels } else { 16 * pixels })
 }
 
 /// Gradients by pixels and by parameters, and what densification decides by.

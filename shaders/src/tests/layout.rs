@@ -72,6 +72,7 @@ fn host_structs_lie_in_memory_as_the_shaders_read_them() {
             tiles,
             absolute,
             structural,
+            is_packed,
             padding,
         }),
         layout_of!(Step {

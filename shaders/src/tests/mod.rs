@@ -11,7 +11,7 @@ mod optimisation;
 mod projection;
 mod sorting;
 #[path = "../../tests/gpu/support.rs"]
-mod support;
+pub(crate) mod support;
 
 use crate::{
     engine::Context,

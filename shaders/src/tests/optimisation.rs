@@ -1,7 +1,10 @@
 //! Loss and optimiser beside those of the CPU engine.
 
+use std::sync::Arc;
+
 use bytemuck::bytes_of;
 use splat::{
+    engine::TrainingView,
     gaussians::gradients::GaussianGradients,
     image::{Image, Mask},
     loss::{LossWorkspace, PhotometricLoss},
@@ -13,12 +16,11 @@ use super::{
     support::{self, arc, blobs, seeds},
 };
 use crate::{
-    buffers::{
-        GradientBuffers, LossBuffers, OptimiserBuffers, allocate, parameters::interleaved, separated, storage,
-    },
+    buffers::{GradientBuffers, LossBuffers, OptimiserBuffers, parameters::interleaved, separated},
     layout::{GEOMETRY, State, Step, View},
     readback::read,
-    stages::{Binder, ViewBuffer},
+    session::{SessionView, session_view},
+    stages::Binder,
 };
 
 /// Values about and beyond [0, 1].
@@ -26,6 +28,12 @@ fn image(width: u32, height: u32, phase: usize) -> Image {
     let count = (3 * width * height) as usize;
     let pixels = seeds(count + phase)[phase..].iter().map(|value| 0.5 + 0.55 * value).collect();
     Image { width, height, pixels }
+}
+
+/// As an 8-bit file has it.
+fn rounded(image: &Image) -> Image {
+    let pixels = image.to_rgb8().into_iter().map(|byte| f32::from(byte) / 255.0).collect();
+    Image { pixels, ..image.clone() }
 }
 
 #[test]
@@ -40,10 +48,12 @@ fn the_loss_and_its_gradient_are_those_of_the_cpu_engine() {
         (33, 70, 0.0, true),
         (5, 90, 1.0, false),
     ] {
-        let (rendered, wanted) = (image(width, height, 0), image(width, height, 7));
+        let rendered = image(width, height, 0);
+        let wanted = image(width, height, 7);
+        let wanted = if is_masked { rounded(&wanted) } else { wanted };
         let pixels = (width * height) as usize;
         let inside: Vec<bool> = (0..pixels).map(|pixel| !is_masked || pixel % 7 < 4).collect();
-        let mask = Mask { width, height, inside: inside.clone() };
+        let mask = Mask { width, height, inside };
         let mut expected = vec![0.0; 3 * pixels];
         let value = PhotometricLoss::new(&wanted, is_masked.then_some(&mask), weight).evaluate(
             &rendered,
@@ -51,28 +61,24 @@ fn the_loss_and_its_gradient_are_those_of_the_cpu_engine() {
             &mut expected,
         );
 
-        let mut data = View::new(&arc(1, width, height)[0], [0.0; 3]);
-        let counted = 3.0 * inside.iter().filter(|&&inside| inside).count() as f32;
-        data.absolute = (1.0 - weight) / counted;
-        data.structural = weight / counted;
-        let view = ViewBuffer::new(device, data).unwrap();
+        let training = TrainingView {
+            camera: arc(1, width, height).swap_remove(0),
+            image: Arc::new(wanted),
+            mask: is_masked.then(|| Arc::new(mask)),
+        };
+        let SessionView { view, wanted, .. } = session_view(device, &training, [0.0; 3], weight).unwrap();
+        assert_eq!(view.data.is_packed, u32::from(is_masked), "masked ones have 8 bits here");
         let gaussians = blobs(1, 0, 1);
-        let buffers = engine.buffers(&gaussians, &data, true).unwrap();
+        let buffers = engine.buffers(&gaussians, &view.data, true).unwrap();
         let gradients = GradientBuffers::new(device, &buffers.size).unwrap();
         let loss = LossBuffers::new(device, &buffers.size, 4).unwrap();
-        let [target] = allocate(device, [storage("wanted", 16 * data.pixels())]).unwrap();
-        let four = |image: &Image, fourth: &dyn Fn(usize) -> f32| -> Vec<[f32; 4]> {
-            let rgb = image.pixels.as_chunks::<3>().0.iter().enumerate();
-            rgb.map(|(pixel, &[red, green, blue])| [red, green, blue, fourth(pixel)]).collect()
-        };
-        let counts = |pixel: usize| f32::from(u8::from(inside[pixel]));
-        device.queue.write_buffer(&target, 0, bytemuck::cast_slice(&four(&wanted, &counts)));
-        let shown = four(&rendered, &|_| 0.5);
+        let colours = rendered.pixels.as_chunks::<3>().0.iter();
+        let shown: Vec<[f32; 4]> = colours.map(|&[red, green, blue]| [red, green, blue, 0.5]).collect();
         device.queue.write_buffer(&buffers.images.rendered, 0, bytemuck::cast_slice(&shown));
         let step = Step { loss_place: 2, ..Step::default() };
         device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
         let binder = Binder { device, kernels: &context.kernels };
-        run(context, &binder.loss(&buffers, &gradients, &loss, &view, &target));
+        run(context, &binder.loss(&buffers, &gradients, &loss, &view, &wanted));
 
         let found: Vec<f32> = read(device, &loss.losses, 3).unwrap();
         assert!((found[2] - value).abs() < 2e-6 * value, "{width}x{height}: {} for {value}", found[2]);

@@ -209,6 +209,19 @@ fn assert_gradients_alike(name: &str, gaussians: &Gaussians, camera: &Camera) {
 }
 
 #[test]
+fn eight_bits_are_the_rounded_rendering() {
+    let Some(gpu) = engine() else { return };
+    for (width, height) in [(1, 1), (17, 13), (64, 48)] {
+        // Brighter than white in places.
+        let mut gaussians = blobs(200, 1, 61);
+        gaussians.sh.iter_mut().for_each(|value| *value *= 2.0);
+        let camera = &arc(1, width, height)[0];
+        let expected = gpu.render(&gaussians, camera, BACKGROUND).unwrap().image.to_rgb8();
+        assert_eq!(gpu.render_rgb8(&gaussians, camera, BACKGROUND).unwrap(), expected, "{width}x{height}");
+    }
+}
+
+#[test]
 fn a_camera_without_pixels_is_refused() {
     let Some(gpu) = engine() else { return };
     for (width, height) in [(0, 17), (17, 0)] {

@@ -24,16 +24,17 @@ const RATES: LearningRates = LearningRates {
     sh_degree: 1,
 };
 
-/// Views of three sizes, as a rig has them.
+/// Views of three sizes, as a rig has them, one of them in 8 bits.
 fn input(gaussians: Gaussians, truth: &Gaussians) -> SessionInput {
     let sizes = [(48, 31), (33, 40), (16, 16)];
     let views = sizes.iter().enumerate().map(|(number, &(width, height))| {
         let camera = arc(3, width, height).swap_remove(number);
-        TrainingView {
-            image: Arc::new(CpuEngine::default().render(truth, &camera, BLACK).unwrap().image),
-            camera,
-            mask: None,
+        let mut image = CpuEngine::default().render(truth, &camera, BLACK).unwrap().image;
+        if number == 0 {
+            // As from an 8-bit file.
+            image.pixels = image.to_rgb8().into_iter().map(|byte| f32::from(byte) / 255.0).collect();
         }
+        TrainingView { image: Arc::new(image), camera, mask: None }
     });
     SessionInput {
         gaussians,

@@ -23,7 +23,9 @@ struct View {
     // Weights of the absolute and the structural term, per pixel and channel that counts.
     absolute: f32,
     structural: f32,
-    padding: vec2<f32>,
+    // 1 if the training image has 8 bits per channel, in one word per pixel; 0 if it has four numbers.
+    is_packed: u32,
+    padding: u32,
 }
 
 // One step: the set of Gaussians, and how it is to be changed.

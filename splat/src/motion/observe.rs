@@ -37,7 +37,8 @@ pub(super) fn observe(
     views: &[MotionView],
     settings: &MotionSettings,
 ) -> Result<Vec<Vec<Observation>>, EngineError> {
-    let mut observations = vec![Vec::new(); gaussians.len()];
+    let mut observations: Vec<Vec<Observation>> =
+        (0..gaussians.len()).map(|_| Vec::with_capacity(views.len())).collect();
     let reweighting = Reweighting {
         passes: settings.reweighting_passes,
         noise_correlation_area: settings.noise_correlation_area,

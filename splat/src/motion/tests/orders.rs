@@ -23,7 +23,7 @@ const SIDE: usize = 224;
 /// less, `LOW_PASS` included, and its mean.
 fn footprint(size: f64, random: &mut ChaCha8Rng) -> (Blend, DVec2) {
     let mut draw = |low: f64, high: f64| random.random_range(low..high);
-    let (cosine, sine) = (|a: f64| (a.cos(), a.sin()))(draw(0.0, std::f64::consts::PI));
+    let (sine, cosine) = draw(0.0, std::f64::consts::PI).sin_cos();
     let turn = DMat2::from_cols(DVec2::new(cosine, sine), DVec2::new(-sine, cosine));
     let variances = DVec2::new(size * size, (size * draw(0.5, 1.0)).powi(2));
     let covariance =
@@ -75,9 +75,9 @@ fn motion(order: Order, random: &mut ChaCha8Rng) -> (DVec2, DMat2) {
     let angle = draw(0.0, std::f64::consts::TAU);
     let shift = DVec2::new(angle.cos(), angle.sin()) * 0.5 * 20f64.powf(draw(0.0, 1.0));
     let size = 0.02 * 25f64.powf(draw(0.0, 1.0));
-    let (p, q) = (|a: f64| (a.cos(), a.sin()))(draw(0.0, std::f64::consts::TAU));
+    let (p, q) = draw(0.0, std::f64::consts::TAU).sin_cos();
     let similarity = DMat2::from_cols(DVec2::new(p, q), DVec2::new(-q, p)) * (size / 2f64.sqrt());
-    let (r, s) = (|a: f64| (a.cos(), a.sin()))(draw(0.0, std::f64::consts::TAU));
+    let (r, s) = draw(0.0, std::f64::consts::TAU).sin_cos();
     let shear = DMat2::from_cols(DVec2::new(r, s), DVec2::new(s, -r)) * (size / 2f64.sqrt());
     match order {
         Order::Static => (DVec2::ZERO, DMat2::ZERO),
