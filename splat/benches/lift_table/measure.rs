@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3};
 use serde::Serialize;
 use splat::{
     gaussians::Gaussians,
-    motion::{self, LiftMethod, MotionField, MotionOrigin, MotionSettings, MotionView, reference},
+    motion::{self, LiftMethod, MotionField, OrderCounts, MotionOrigin, MotionSettings, MotionView, reference},
 };
 
 use super::{
@@ -122,6 +122,8 @@ fn unmoved(count: usize) -> MotionField {
         origin: vec![MotionOrigin::Unsolved; count],
         information: vec![glam::DMat3::ZERO; count],
         turns_harmonics: false,
+        log_scale: vec![DVec3::ZERO; count],
+        orders: OrderCounts::default(),
     }
 }
 

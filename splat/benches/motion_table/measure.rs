@@ -11,7 +11,7 @@ use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::Gaussians,
-    motion::{self, MotionOrigin, MotionSettings, MotionStage, MotionView, moments::FootprintMoments},
+    motion::{self, MotionOrigin, MotionSettings, MotionStage, MotionView, moments::FootprintMoments, reweighting::Reweighting},
     raster::CpuEngine,
     tracking::TrackField,
 };
@@ -147,9 +147,10 @@ impl Engine for Timed {
         gaussians: &Gaussians,
         camera: &Camera,
         tracks: &TrackField,
+        reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         let start = now();
-        let moments = self.engine.footprint_moments(gaussians, camera, tracks);
+        let moments = self.engine.footprint_moments(gaussians, camera, tracks, reweighting);
         *self.moments.lock().unwrap_or_else(PoisonError::into_inner) += now().saturating_sub(start);
         moments
     }

@@ -5,7 +5,12 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::LearningRates;
-use crate::gaussians::{Gaussians, gradients::GaussianGradients, sh};
+use crate::gaussians::{
+    Gaussians,
+    gradients::GaussianGradients,
+    part::{Part, PartMut},
+    sh,
+};
 
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
@@ -15,37 +20,38 @@ const EPSILON: f32 = 1e-15;
 /// Gaussians of one parallel task.
 const CHUNK: usize = 4096;
 
+/// Spherical-harmonic values of a Gaussian of the highest degree.
+const MOST_SH: usize = 3 * sh::coefficients(sh::MAX_DEGREE);
+
 /// Optimiser state of a set of Gaussians: two moments per parameter and one step count.
 #[derive(Clone, Debug)]
 pub struct Adam {
     steps: u64,
-    gaussians: usize,
-    means: Moments,
-    rotations: Moments,
-    log_scales: Moments,
-    logit_opacities: Moments,
-    sh: Moments,
+    /// Spherical-harmonic values per Gaussian.
+    sh_stride: usize,
+    first: GaussianGradients,
+    second: GaussianGradients,
 }
 
-/// First and second moments of one parameter class, `N × width`.
-#[derive(Clone, Debug)]
-struct Moments {
-    width: usize,
-    first: Vec<f32>,
-    second: Vec<f32>,
+/// Parameters and moments of consecutive Gaussians.
+pub(crate) struct AdamPart<'a> {
+    pub values: PartMut<'a>,
+    first: PartMut<'a>,
+    second: PartMut<'a>,
 }
 
-/// Parameters of a class, counted within one Gaussian, that share a rate.
-struct Span {
-    range: Range<usize>,
-    rate: f32,
-}
-
-/// What one step's update has in common for all parameters.
-#[derive(Clone, Copy)]
-struct Correction {
-    /// `1 / (1 - beta1^t)`.
-    first: f32,
+/// What one step's update has in common for all Gaussians: the rate of each class times the correction
+/// `1 / (1 - beta1^t)`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Descent {
+    mean: f32,
+    rotation: f32,
+    log_scale: f32,
+    logit_opacity: f32,
+    /// Of each spherical-harmonic value of a Gaussian.
+    sh: [f32; MOST_SH],
+    /// How many of them are updated.
+    sh_used: usize,
     /// `1 / sqrt(1 - beta2^t)`.
     second_root: f32,
 }
@@ -53,17 +59,8 @@ struct Correction {
 impl Adam {
     /// Zero moments for a set.
     pub fn new(gaussians: &Gaussians) -> Self {
-        let count = gaussians.len();
-        let zeros = |width| Moments::zeros(count, width);
-        Self {
-            steps: 0,
-            gaussians: count,
-            means: zeros(3),
-            rotations: zeros(4),
-            log_scales: zeros(3),
-            logit_opacities: zeros(1),
-            sh: zeros(3 * gaussians.sh_coefficients()),
-        }
+        let zeros = GaussianGradients::zeros(gaussians);
+        Self { steps: 0, sh_stride: 3 * gaussians.sh_coefficients(), first: zeros.clone(), second: zeros }
     }
 
     /// Steps taken so far.
@@ -85,53 +82,50 @@ impl Adam {
         rates: &LearningRates,
         active: Option<&[bool]>,
     ) {
-        assert_eq!(gaussians.len(), self.gaussians, "the optimiser was made for another number of Gaussians");
         assert!(
-            active.is_none_or(|active| active.len() == self.gaussians),
+            active.is_none_or(|active| active.len() == gaussians.len()),
             "one active flag per Gaussian is needed"
         );
+        let active = active.unwrap_or_default();
+        let descent = self.begin_step(gaussians, rates);
+        self.parts(gaussians, CHUNK).enumerate().for_each(|(chunk, mut part)| {
+            let range = chunk * CHUNK..chunk * CHUNK + part.values.means.len();
+            let active = active.get(range.clone()).unwrap_or_default();
+            part.descend(gradient.part().slice(range), active, &descent);
+        });
+    }
 
+    /// Counts a step that [`AdamPart::descend`] then takes, part by part.
+    pub(crate) fn begin_step(&mut self, gaussians: &Gaussians, rates: &LearningRates) -> Descent {
         self.steps += 1;
         let steps = self.steps as f64;
-        let correction = Correction {
-            first: (1.0 / (1.0 - BETA1.powf(steps))) as f32,
+        let correction = (1.0 / (1.0 - BETA1.powf(steps))) as f32;
+        let mut sh = [rates.sh_rest * correction; MOST_SH];
+        sh[..3].fill(rates.sh_dc * correction);
+        Descent {
+            mean: rates.mean * correction,
+            rotation: rates.rotation * correction,
+            log_scale: rates.log_scale * correction,
+            logit_opacity: rates.logit_opacity * correction,
+            sh,
+            sh_used: 3 * sh::coefficients(rates.sh_degree.min(gaussians.sh_degree)),
             second_root: (1.0 / (1.0 - BETA2.powf(steps)).sqrt()) as f32,
-        };
-        let coefficients = sh::coefficients(rates.sh_degree.min(gaussians.sh_degree));
-        let whole = |range, rate| [Span { range, rate }];
+        }
+    }
 
-        let update = |moments: &mut Moments, values: &mut [f32], gradient: &[f32], spans: &[Span]| {
-            moments.update(values, gradient, spans, active, correction);
-        };
-        update(
-            &mut self.means,
-            gaussians.means.as_flattened_mut(),
-            gradient.means.as_flattened(),
-            &whole(0..3, rates.mean),
-        );
-        update(
-            &mut self.rotations,
-            gaussians.rotations.as_flattened_mut(),
-            gradient.rotations.as_flattened(),
-            &whole(0..4, rates.rotation),
-        );
-        update(
-            &mut self.log_scales,
-            gaussians.log_scales.as_flattened_mut(),
-            gradient.log_scales.as_flattened(),
-            &whole(0..3, rates.log_scale),
-        );
-        update(
-            &mut self.logit_opacities,
-            &mut gaussians.logit_opacities,
-            &gradient.logit_opacities,
-            &whole(0..1, rates.logit_opacity),
-        );
-        let bands = [
-            Span { range: 0..3, rate: rates.sh_dc },
-            Span { range: 3..3 * coefficients, rate: rates.sh_rest },
-        ];
-        update(&mut self.sh, &mut gaussians.sh, &gradient.sh, &bands);
+    /// Parameters and moments for parallel tasks of `size` Gaussians.
+    ///
+    /// # Panics
+    /// If this state was made for another set.
+    pub(crate) fn parts<'a>(
+        &'a mut self,
+        gaussians: &'a mut Gaussians,
+        size: usize,
+    ) -> impl IndexedParallelIterator<Item = AdamPart<'a>> {
+        let fits = gaussians.len() == self.first.means.len() && gaussians.sh.len() == self.first.sh.len();
+        assert!(fits, "the optimiser was made for another set of Gaussians");
+        let arrays = (gaussians.parts_mut(size), self.first.parts_mut(size), self.second.parts_mut(size));
+        arrays.into_par_iter().map(|(values, first, second)| AdamPart { values, first, second })
     }
 
     /// Follows a change of the set: new Gaussian `i` takes over the moments of the old Gaussian `source[i]`, or starts
@@ -140,99 +134,160 @@ impl Adam {
     /// # Panics
     /// If `source` names a Gaussian that is not in the old set.
     pub fn replace(&mut self, source: &[Option<usize>]) {
-        self.gaussians = source.len();
-        let classes = [
-            &mut self.means,
-            &mut self.rotations,
-            &mut self.log_scales,
-            &mut self.logit_opacities,
-            &mut self.sh,
-        ];
-        for moments in classes {
-            moments.replace(source);
+        for moments in [&mut self.first, &mut self.second] {
+            let GaussianGradients { means, rotations, log_scales, logit_opacities, sh } = &*moments;
+            *moments = GaussianGradients {
+                means: taken(means, source),
+                rotations: taken(rotations, source),
+                log_scales: taken(log_scales, source),
+                logit_opacities: taken(logit_opacities, source),
+                sh: taken_rows(sh, self.sh_stride, source),
+            };
         }
     }
 }
 
-impl Moments {
-    fn zeros(count: usize, width: usize) -> Self {
-        Self { width, first: vec![0.0; count * width], second: vec![0.0; count * width] }
-    }
+fn taken<T: Copy + Default>(old: &[T], source: &[Option<usize>]) -> Vec<T> {
+    source.iter().map(|source| source.map_or_else(T::default, |source| old[source])).collect()
+}
 
-    fn update(
-        &mut self,
-        values: &mut [f32],
-        gradient: &[f32],
-        spans: &[Span],
-        active: Option<&[bool]>,
-        correction: Correction,
-    ) {
-        assert_eq!(values.len(), self.first.len(), "the optimiser was made for another set of Gaussians");
-        assert_eq!(gradient.len(), self.first.len(), "one gradient per parameter is needed");
-        let width = self.width;
-        values
-            .par_chunks_mut(CHUNK * width)
-            .zip(gradient.par_chunks(CHUNK * width))
-            .zip(self.first.par_chunks_mut(CHUNK * width))
-            .zip(self.second.par_chunks_mut(CHUNK * width))
-            .enumerate()
-            .for_each(|(chunk, (((values, gradient), first), second))| {
-                // One rate for everything: no need to go Gaussian by Gaussian.
-                if let ([span], None) = (spans, active) {
-                    return descend(values, gradient, first, second, span.rate, correction);
-                }
-                for gaussian in 0..values.len() / width {
-                    if active.is_some_and(|active| !active[chunk * CHUNK + gaussian]) {
-                        continue;
-                    }
-                    for span in spans {
-                        let range = gaussian * width + span.range.start..gaussian * width + span.range.end;
-                        descend(
-                            &mut values[range.clone()],
-                            &gradient[range.clone()],
-                            &mut first[range.clone()],
-                            &mut second[range],
-                            span.rate,
-                            correction,
-                        );
-                    }
-                }
-            });
-    }
-
-    fn replace(&mut self, source: &[Option<usize>]) {
-        let mut new = Self::zeros(source.len(), self.width);
-        for (target, source) in source.iter().enumerate() {
-            let Some(source) = source else { continue };
-            let (from, to) = (source * self.width, target * self.width);
-            new.first[to..to + self.width].copy_from_slice(&self.first[from..from + self.width]);
-            new.second[to..to + self.width].copy_from_slice(&self.second[from..from + self.width]);
+fn taken_rows(old: &[f32], width: usize, source: &[Option<usize>]) -> Vec<f32> {
+    let mut new = vec![0.0; source.len() * width];
+    for (target, source) in new.chunks_exact_mut(width).zip(source) {
+        if let Some(source) = source {
+            target.copy_from_slice(&old[source * width..(source + 1) * width]);
         }
-        *self = new;
+    }
+    new
+}
+
+impl AdamPart<'_> {
+    /// The Gaussians of `range`.
+    #[inline(always)]
+    pub(crate) fn slice(&mut self, range: Range<usize>) -> AdamPart<'_> {
+        AdamPart {
+            values: self.values.slice(range.clone()),
+            first: self.first.slice(range.clone()),
+            second: self.second.slice(range),
+        }
+    }
+
+    /// Updates the Gaussians of the part that are `active` (empty: all).
+    #[inline(always)]
+    pub(crate) fn descend(&mut self, gradient: Part<'_>, active: &[bool], descent: &Descent) {
+        if active.is_empty() {
+            return self.descend_all(gradient, descent);
+        }
+        let mut start = 0;
+        for run in active.chunk_by(PartialEq::eq) {
+            let range = start..start + run.len();
+            start = range.end;
+            if run[0] {
+                self.slice(range.clone()).descend_all(gradient.slice(range), descent);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn descend_all(&mut self, gradient: Part<'_>, descent: &Descent) {
+        let (values, first, second) = (&mut self.values, &mut self.first, &mut self.second);
+        let root = descent.second_root;
+        descend(
+            values.means.as_flattened_mut(),
+            gradient.means.as_flattened(),
+            first.means.as_flattened_mut(),
+            second.means.as_flattened_mut(),
+            descent.mean,
+            root,
+        );
+        descend(
+            values.rotations.as_flattened_mut(),
+            gradient.rotations.as_flattened(),
+            first.rotations.as_flattened_mut(),
+            second.rotations.as_flattened_mut(),
+            descent.rotation,
+            root,
+        );
+        descend(
+            values.log_scales.as_flattened_mut(),
+            gradient.log_scales.as_flattened(),
+            first.log_scales.as_flattened_mut(),
+            second.log_scales.as_flattened_mut(),
+            descent.log_scale,
+            root,
+        );
+        descend(
+            values.logit_opacities,
+            gradient.logit_opacities,
+            first.logit_opacities,
+            second.logit_opacities,
+            descent.logit_opacity,
+            root,
+        );
+        // As many loops as there are degrees, each of a length that the compiler knows.
+        match descent.sh_used {
+            3 => self.descend_coefficients::<3>(gradient, descent),
+            12 => self.descend_coefficients::<12>(gradient, descent),
+            27 => self.descend_coefficients::<27>(gradient, descent),
+            _ => self.descend_coefficients::<MOST_SH>(gradient, descent),
+        }
+    }
+
+    /// Updates the first `USED` spherical-harmonic values of each Gaussian.
+    #[inline(always)]
+    fn descend_coefficients<const USED: usize>(&mut self, gradient: Part<'_>, descent: &Descent) {
+        let stride = gradient.sh_stride();
+        for row in 0..gradient.len() {
+            let at = row * stride;
+            let arrays = (
+                self.values.sh[at..].first_chunk_mut::<USED>(),
+                gradient.sh[at..].first_chunk::<USED>(),
+                self.first.sh[at..].first_chunk_mut::<USED>(),
+                self.second.sh[at..].first_chunk_mut::<USED>(),
+            );
+            let (Some(values), Some(gradient), Some(first), Some(second)) = arrays else { return };
+            for at in 0..USED {
+                let step = descent.sh[at];
+                (values[at], first[at], second[at]) =
+                    descended(values[at], gradient[at], first[at], second[at], step, descent.second_root);
+            }
+        }
     }
 }
 
 /// Updates parameters of one rate together with their moments.
-#[inline]
+#[inline(always)]
 fn descend(
     values: &mut [f32],
     gradient: &[f32],
     first: &mut [f32],
     second: &mut [f32],
-    rate: f32,
-    correction: Correction,
+    step: f32,
+    second_root: f32,
 ) {
+    let length = values.len();
+    let (gradient, first, second) = (&gradient[..length], &mut first[..length], &mut second[..length]);
+    for at in 0..length {
+        (values[at], first[at], second[at]) =
+            descended(values[at], gradient[at], first[at], second[at], step, second_root);
+    }
+}
+
+/// One parameter and its moments after the step.
+#[inline(always)]
+fn descended(
+    value: f32,
+    slope: f32,
+    first: f32,
+    second: f32,
+    step: f32,
+    second_root: f32,
+) -> (f32, f32, f32) {
     const B1: f32 = BETA1 as f32;
     const B2: f32 = BETA2 as f32;
     const ONE_MINUS_B1: f32 = (1.0 - BETA1) as f32;
     const ONE_MINUS_B2: f32 = (1.0 - BETA2) as f32;
-    let step = rate * correction.first;
-    let length = values.len();
-    let (gradient, first, second) = (&gradient[..length], &mut first[..length], &mut second[..length]);
-    for at in 0..length {
-        let slope = gradient[at];
-        first[at] = B1 * first[at] + ONE_MINUS_B1 * slope;
-        second[at] = B2 * second[at] + ONE_MINUS_B2 * (slope * slope);
-        values[at] -= step * first[at] / (second[at].sqrt() * correction.second_root + EPSILON);
-    }
+    let first = B1 * first + ONE_MINUS_B1 * slope;
+    let second = B2 * second + ONE_MINUS_B2 * (slope * slope);
+    (value - step * first / (second.sqrt() * second_root + EPSILON), first, second)
 }

@@ -7,6 +7,7 @@ mod tests;
 
 use serde::{Deserialize, Serialize};
 
+pub(crate) use self::adam::{AdamPart, Descent};
 pub use self::{
     adam::Adam,
     schedule::{Epochs, Plateau},

@@ -3,8 +3,11 @@
 use super::harmonics::{MOST, basis, direction_gradient};
 use crate::{
     gaussians::{part::Part, sh},
-    simd::{LANES, Simd},
+    simd::{LANES, Simd, prefetch},
 };
+
+/// Gaussians whose coefficients are asked for ahead.
+const AHEAD: usize = LANES;
 
 /// A value per channel or axis, and lane.
 pub(super) type Triple = [[f32; LANES]; 3];
@@ -42,6 +45,10 @@ impl<S: Simd> Coefficients<S> {
             for (lane, row) in block.iter_mut().enumerate() {
                 let start = (first + lane).min(part.len() - 1) * stride;
                 let rest = &part.sh[start + number * LANES..start + used];
+                // Sixteen rows side by side are no pattern that a processor foresees.
+                if let Some(later) = part.sh.get(start + number * LANES + AHEAD * stride) {
+                    prefetch(later);
+                }
                 *row = match rest.first_chunk() {
                     Some(whole) => S::load(whole),
                     None => {

@@ -52,16 +52,6 @@ impl<D: Doubles> Vector<D> {
             z: self.z.mul_add(factor, term.z),
         }
     }
-
-    /// `yes` where the flag is set, else `no`.
-    #[inline(always)]
-    pub(super) fn select(mask: D::Mask, yes: Self, no: Self) -> Self {
-        Self {
-            x: D::select(mask, yes.x, no.x),
-            y: D::select(mask, yes.y, no.y),
-            z: D::select(mask, yes.z, no.z),
-        }
-    }
 }
 
 impl<D: Doubles> Add for Vector<D> {

@@ -60,7 +60,7 @@ impl<D: Doubles> Lens<D> {
 
     /// World points in camera axes.
     #[inline(always)]
-    pub(super) fn to_camera(&self, world: Vector<D>) -> Vector<D> {
+    pub(super) fn camera_point(&self, world: Vector<D>) -> Vector<D> {
         dots(&self.axes, world) + self.translation
     }
 }

@@ -1,7 +1,8 @@
 //! The CPU engine: differentiable rasterization of 3D Gaussians in blocks of 4 × 4 pixels.
 //!
 //! One file per stage, each named as the stage: [`project`] → [`bin`] → [`blend`] → [`blend_backward`] →
-//! [`project_backward`], strung together by [`Pass`]; [`footprint_moments`] and [`block_moments`] share the first two. The equations are those of 3D Gaussian
+//! [`project_backward`], strung together by [`Pass`]; a step of a session ends with [`descend`] in place of the last, and
+//! [`footprint_moments`] and [`block_moments`] share the first two. The equations are those of 3D Gaussian
 //! Splatting (Kerbl et al. 2023, section 4 and 6) over EWA splatting (Zwicker et al. 2001).
 //!
 //! An image is cut into bands of [`bin::BAND_ROWS`] rows whatever the number of threads; every sum over bands is
@@ -15,6 +16,7 @@ mod blocks;
 mod colour;
 mod counts;
 mod depth_order;
+mod descend;
 mod engine;
 mod footprint_moments;
 mod harmonics;

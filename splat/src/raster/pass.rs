@@ -7,14 +7,17 @@ use super::{
     blend::{Band, blend},
     blend_backward::blend_backward,
     blocks::{BandView, RoundLimit},
+    descend::{DensityPart, descend},
     local::View,
     project::{CHUNK, project},
     project_backward::{Backward, project_backward},
 };
 use crate::{
     cameras::Camera,
+    engine::DensityStatistics,
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
+    optim::{Adam, LearningRates},
     simd::Instructions,
 };
 
@@ -29,7 +32,6 @@ pub struct Pass {
     /// What [`Pass::blend`] was told.
     active: Vec<bool>,
     pub(super) limit: RoundLimit,
-    by_projected_mean: Vec<[f32; 2]>,
 }
 
 impl Pass {
@@ -116,29 +118,43 @@ impl Pass {
     /// Stage 5: writes the gradient by every parameter; zero for Gaussians that the view does not show or that are not
     /// active.
     pub fn project_backward(
-        &mut self,
+        &self,
         gaussians: &Gaussians,
         camera: &Camera,
         sh_degree: u32,
         active: &[bool],
         gradients: &mut GaussianGradients,
     ) {
-        let (bins, bands, instructions) = (&self.bins, &self.bands, self.instructions);
-        let backward = Backward { view: View::new(camera, gaussians, sh_degree), bins, bands, active };
-        self.by_projected_mean.resize(gaussians.len(), [0.0; 2]);
-        let projected_means = self.by_projected_mean.par_chunks_mut(CHUNK);
-        gradients.parts_mut(CHUNK).zip(projected_means).enumerate().for_each(
-            |(chunk, (gradients, projected_means))| {
-                let first = chunk * CHUNK;
-                let part = gaussians.part().slice(first..first + projected_means.len());
-                project_backward(instructions, part, &backward, first, gradients, projected_means);
-            },
-        );
+        let instructions = self.instructions;
+        let backward = self.backward(View::new(camera, gaussians, sh_degree), active);
+        gradients.parts_mut(CHUNK).enumerate().for_each(|(chunk, gradients)| {
+            let first = chunk * CHUNK;
+            let part = gaussians.part().slice(first..first + gradients.means.len());
+            project_backward(instructions, part, &backward, first, gradients);
+        });
     }
 
-    /// The Gaussians that the view shows, each with the gradient by its projected mean, per pixel, after stage 5.
-    pub fn visible(&self) -> impl Iterator<Item = (usize, [f32; 2])> {
-        let all = self.by_projected_mean.iter().copied().enumerate();
-        all.filter(|&(index, _)| self.bins.projection.is_visible(index))
+    /// Stages 5 and 6 in one, without the memory of the gradients: a step of Adam with the gradient by every parameter of
+    /// the active Gaussians (empty: all). Adds to the density statistics.
+    pub fn descend(
+        &self,
+        gaussians: &mut Gaussians,
+        camera: &Camera,
+        rates: &LearningRates,
+        active: &[bool],
+        adam: &mut Adam,
+        density: &mut DensityStatistics,
+    ) {
+        let instructions = self.instructions;
+        let backward = self.backward(View::new(camera, gaussians, rates.sh_degree), active);
+        let descent = adam.begin_step(gaussians, rates);
+        let density = DensityPart::parts(density, CHUNK, [camera.width, camera.height]);
+        adam.parts(gaussians, CHUNK).zip(density).enumerate().for_each(|(chunk, (part, density))| {
+            descend(instructions, part, &backward, chunk * CHUNK, &descent, density);
+        });
+    }
+
+    fn backward<'a>(&'a self, view: View<'a>, active: &'a [bool]) -> Backward<'a> {
+        Backward { view, bins: &self.bins, bands: &self.bands, active }
     }
 }

@@ -67,8 +67,6 @@ pub(super) struct Footprint {
     pub inverse_conditional: f64,
     /// Inverse of the variance across rows, 1 / pixels².
     pub inverse_yy: f64,
-    /// Opacity in `[0, 1]`.
-    pub opacity: f64,
     /// Natural logarithm of the opacity.
     pub log_opacity: f64,
     /// Exponent at which alpha falls to [`ALPHA_MIN`], `ln(opacity / ALPHA_MIN)`.
@@ -161,7 +159,6 @@ struct Octet {
     conditional: [f64; OCTET],
     inverse_conditional: [f64; OCTET],
     inverse_yy: [f64; OCTET],
-    opacity: [f64; OCTET],
     log_opacity: [f64; OCTET],
     reach: [f64; OCTET],
     half_height: [f64; OCTET],
@@ -180,7 +177,6 @@ impl Octet {
         conditional: [0.0; OCTET],
         inverse_conditional: [0.0; OCTET],
         inverse_yy: [0.0; OCTET],
-        opacity: [0.0; OCTET],
         log_opacity: [0.0; OCTET],
         reach: [0.0; OCTET],
         half_height: [0.0; OCTET],
@@ -202,9 +198,8 @@ impl Octet {
         let centre = D::splat(0.5);
         let mut octet = Self::EMPTY;
         let gaussians = Geometry::<D>::load(part, first);
-        let point = lens.to_camera(gaussians.mean);
-        let opacity = sigmoid(gaussians.logit_opacity);
-        let log_opacity = opacity.ln();
+        let point = lens.camera_point(gaussians.mean);
+        let log_opacity = sigmoid(gaussians.logit_opacity).ln();
         let reach = log_opacity - D::splat(ALPHA_MIN.into()).ln();
         // Comparisons with NaN are false: what is no number is not drawn.
         let mut visible = D::both(point.z.gt(D::splat(NEAR_PLANE)), reach.ge(zero));
@@ -233,7 +228,6 @@ impl Octet {
         covariance.conditional.store(&mut octet.conditional);
         covariance.inverse_conditional.store(&mut octet.inverse_conditional);
         covariance.inverse_yy.store(&mut octet.inverse_yy);
-        opacity.store(&mut octet.opacity);
         log_opacity.store(&mut octet.log_opacity);
         reach.store(&mut octet.reach);
         half_height.store(&mut octet.half_height);
@@ -262,7 +256,6 @@ impl Octet {
                 conditional: self.conditional[lane],
                 inverse_conditional: self.inverse_conditional[lane],
                 inverse_yy: self.inverse_yy[lane],
-                opacity: self.opacity[lane],
                 log_opacity: self.log_opacity[lane],
                 reach: self.reach[lane],
                 half_height: self.half_height[lane],

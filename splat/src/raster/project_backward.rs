@@ -1,7 +1,5 @@
 //! Stage 5: from the gradient of a footprint to the gradient of the Gaussian's parameters, eight Gaussians at a time in f64.
 
-use std::ops::Range;
-
 use super::{
     bin::Bins,
     blend::Band,
@@ -15,7 +13,16 @@ use crate::{
 };
 
 /// Values of [`Sums`](super::blend_backward::Sums) that are of use.
-const SUMS: usize = 9;
+pub(super) const SUMS: usize = 9;
+
+/// Of sixteen Gaussians, value by lane.
+pub(super) type GroupSums = [[f64; LANES]; SUMS];
+
+/// Gaussians between one part of the work and the next: what is handed over fits a near cache.
+pub(super) const GRANULE: usize = 256;
+
+/// Gaussians whose sums are asked for ahead.
+const AHEAD: usize = 16;
 
 /// What the gradients of the Gaussians of a view start from.
 pub(super) struct Backward<'a> {
@@ -27,63 +34,82 @@ pub(super) struct Backward<'a> {
 }
 
 impl Backward<'_> {
-    /// Of up to sixteen Gaussians from `first` on, those that need a gradient: bit `n` is that of Gaussian `first + n`.
+    /// Of up to sixteen Gaussians from `first` on, those that the view shows: bit `n` is that of Gaussian `first + n`.
+    #[inline(always)]
+    pub(super) fn visible(&self, first: usize, count: usize) -> u16 {
+        let mut visible = 0;
+        for lane in 0..count {
+            visible |= u16::from(self.bins.projection.is_visible(first + lane)) << lane;
+        }
+        visible
+    }
+
+    /// And that are active.
     #[inline(always)]
     fn wanted(&self, first: usize, count: usize) -> u16 {
-        let mut wanted = 0;
-        for lane in 0..count {
-            let is_active = self.active.get(first + lane).copied().unwrap_or(true);
-            wanted |= u16::from(is_active & self.bins.projection.is_visible(first + lane)) << lane;
+        let mut wanted = self.visible(first, count);
+        if let Some(active) = self.active.get(first..first + count) {
+            for (lane, &is_active) in active.iter().enumerate() {
+                wanted &= !(u16::from(!is_active) << lane);
+            }
         }
         wanted
     }
 
-    /// Bands keep their sums in depth order, which is no order in memory.
+    /// Sums over the bands, of Gaussians from `first` on, a group after the other; zero for those that need no gradient.
+    ///
+    /// Bands keep their sums in depth order, which is no order in memory: a loop that does nothing else has the most
+    /// lines of memory under way.
     #[inline(always)]
-    fn prefetch_sums(&self, indices: Range<usize>) {
-        for index in indices {
-            let (first_band, places) = self.bins.places_of(index);
-            for (band, &place) in self.bands[first_band..].iter().zip(places) {
-                let sums = &band.sums[place as usize];
-                prefetch(&sums[0]);
-                prefetch(&sums[8]);
+    pub(super) fn gather(&self, first: usize, count: usize, groups: &mut [GroupSums]) {
+        for index in first..first + count.min(AHEAD) {
+            self.prefetch_sums(index);
+        }
+        for (number, group) in groups.iter_mut().enumerate().take(count.div_ceil(LANES)) {
+            *group = [[0.0; LANES]; SUMS];
+            let start = number * LANES;
+            for place in start..count.min(start + LANES) {
+                self.prefetch_sums(first + (place + AHEAD).min(count - 1));
+                self.sum(first + place, place - start, group);
             }
         }
     }
 
-    /// Sums over the bands of the Gaussians of `wanted`, from `first` on, value by lane; zero for the others.
     #[inline(always)]
-    fn sums(&self, first: usize, wanted: u16) -> [[f64; LANES]; SUMS] {
-        let mut by_value = [[0.0; LANES]; SUMS];
-        for lane in 0..LANES {
-            if wanted >> lane & 1 == 0 {
-                continue;
-            }
-            let mut total = [0.0; 12];
-            let (first_band, places) = self.bins.places_of(first + lane);
-            for (band, &place) in self.bands[first_band..].iter().zip(places) {
-                let sums = &band.sums[place as usize];
-                for value in 0..12 {
-                    total[value] += f64::from(sums[value]);
-                }
-            }
-            for (values, total) in by_value.iter_mut().zip(total) {
-                values[lane] = total;
+    fn prefetch_sums(&self, index: usize) {
+        let (first_band, places) = self.bins.places_of(index);
+        for (band, &place) in self.bands[first_band..].iter().zip(places) {
+            // They may lie across two lines.
+            let sums = &band.sums[place as usize];
+            prefetch(&sums[0]);
+            prefetch(&sums[11]);
+        }
+    }
+
+    #[inline(always)]
+    fn sum(&self, index: usize, lane: usize, group: &mut GroupSums) {
+        let (first_band, places) = self.bins.places_of(index);
+        let mut total = [0.0; 12];
+        for (band, &place) in self.bands[first_band..].iter().zip(places) {
+            let sums = &band.sums[place as usize];
+            for value in 0..12 {
+                total[value] += f64::from(sums[value]);
             }
         }
-        by_value
+        for (values, total) in group.iter_mut().zip(total) {
+            values[lane] = total;
+        }
     }
 }
 
 simd_kernel! {
-    /// Writes the gradients of the Gaussians of a part, the first of which is number `first` of the view, and those by
-    /// their projected means, per pixel; zero for those that the view does not show or that are not active.
+    /// Writes the gradients of the Gaussians of a part, the first of which is number `first` of the view; zero for those
+    /// that the view does not show or that are not active.
     pub(super) fn project_backward(
         part: Part<'_>,
         backward: &Backward<'_>,
         first: usize,
         gradients: PartMut<'_>,
-        projected_means: &mut [[f32; 2]],
     ) = project_backward_kernel
 }
 
@@ -93,32 +119,46 @@ fn project_backward_kernel<S: Simd>(
     backward: &Backward<'_>,
     first: usize,
     mut gradients: PartMut<'_>,
-    projected_means: &mut [[f32; 2]],
 ) {
     let lens = Lens::<S::Doubles>::new(backward.view.camera);
     let count = part.len();
-    for place in (0..count).step_by(LANES) {
-        let end = count.min(place + LANES);
-        backward.prefetch_sums(first + end..first + count.min(end + LANES));
-        let gradients = gradients.slice(place..end);
-        let projected_means = &mut projected_means[place..end];
-        group_backward::<S>(&part, place, backward, first + place, &lens, gradients, projected_means);
+    let mut projected_means = [[0.0; 2]; LANES];
+    let mut sums = [[[0.0; LANES]; SUMS]; GRANULE / LANES];
+    for granule in (0..count).step_by(GRANULE) {
+        let end = count.min(granule + GRANULE);
+        backward.gather(first + granule, end - granule, &mut sums);
+        for (place, sums) in (granule..end).step_by(LANES).zip(&sums) {
+            let end = end.min(place + LANES);
+            let gradients = gradients.slice(place..end);
+            let projected_means = &mut projected_means[..end - place];
+            group_backward::<S>(
+                &part,
+                place,
+                backward,
+                first + place,
+                sums,
+                &lens,
+                gradients,
+                projected_means,
+            );
+        }
     }
 }
 
-/// Up to sixteen Gaussians, from `place` on in the part and from `index` on in the view.
+/// Gradients of up to sixteen Gaussians, from `place` on in the part and from `index` on in the view, and those by their
+/// projected means, per pixel.
 #[inline(always)]
-fn group_backward<S: Simd>(
+pub(super) fn group_backward<S: Simd>(
     part: &Part<'_>,
     place: usize,
     backward: &Backward<'_>,
     index: usize,
+    sums: &GroupSums,
     lens: &Lens<S::Doubles>,
     mut gradients: PartMut<'_>,
     projected_means: &mut [[f32; 2]],
 ) {
     let wanted = backward.wanted(index, projected_means.len());
-    let sums = backward.sums(index, wanted);
     let mut directions = [[0.0; LANES]; 3];
     for half in 0..LANES / OCTET {
         let mean = load_means::<S::Doubles>(part, place + half * OCTET);
@@ -135,7 +175,7 @@ fn group_backward<S: Simd>(
     let mut kept = 0;
     for (half, projected_means) in projected_means.chunks_mut(OCTET).enumerate() {
         let first = half * OCTET;
-        let sums = FootprintGradient::<S::Doubles>::new(&sums, half);
+        let sums = FootprintGradient::<S::Doubles>::new(sums, half);
         let gaussians = Geometry::load(part, place + first);
         let gradient = Gradient::new(&gaussians, &sums, &by_direction, half, lens);
         let finite = gradient.fits_single() & (wanted >> first) as u8;
@@ -210,7 +250,7 @@ impl<D: Doubles> Gradient<D> {
         half: usize,
         lens: &Lens<D>,
     ) -> Self {
-        let point = lens.to_camera(gaussians.mean);
+        let point = lens.camera_point(gaussians.mean);
         let local = LocalProjection::new(gaussians, point, lens);
         let covariance = Covariance::new(local.spread);
         let projected_mean = mean_gradient(&covariance, gradient);

@@ -4,7 +4,7 @@ use super::pass::Pass;
 use crate::{
     cameras::Camera,
     engine::{DensityStatistics, EngineError, Session, SessionInput},
-    gaussians::{Gaussians, gradients::GaussianGradients},
+    gaussians::Gaussians,
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
     optim::{Adam, LearningRates},
@@ -29,7 +29,6 @@ pub(super) struct CpuSession {
     rendered: Image,
     image_gradient: Vec<f32>,
     workspace: LossWorkspace,
-    gradients: GaussianGradients,
     adam: Adam,
     density: DensityStatistics,
     /// Of the steps since they were last taken.
@@ -51,7 +50,6 @@ impl CpuSession {
             .collect();
         Ok(Self {
             adam: Adam::new(&input.gaussians),
-            gradients: GaussianGradients::zeros(&input.gaussians),
             density: empty_statistics(count),
             active: input.frozen.iter().map(|frozen| !frozen).collect(),
             gaussians: input.gaussians,
@@ -87,20 +85,14 @@ impl Session for CpuSession {
         self.pass.blend(camera, self.background, &self.active, &mut self.rendered, &mut []);
         let value = loss.evaluate(&self.rendered, &mut self.workspace, &mut self.image_gradient);
         self.pass.blend_backward(camera, self.background, &self.image_gradient, &[]);
-        self.pass.project_backward(
-            &self.gaussians,
+        self.pass.descend(
+            &mut self.gaussians,
             camera,
-            rates.sh_degree,
+            rates,
             &self.active,
-            &mut self.gradients,
+            &mut self.adam,
+            &mut self.density,
         );
-        let half_size = [camera.width as f32 / 2.0, camera.height as f32 / 2.0];
-        for (index, [x, y]) in self.pass.visible() {
-            self.density.gradient_norm[index] += (x * half_size[0]).hypot(y * half_size[1]);
-            self.density.visible_steps[index] += 1;
-        }
-        let active = (!self.active.is_empty()).then_some(self.active.as_slice());
-        self.adam.step(&mut self.gaussians, &self.gradients, rates, active);
         self.losses.push(value);
         Ok(())
     }
@@ -141,7 +133,6 @@ impl Session for CpuSession {
             self.active = source.iter().map(|old| old.is_none_or(|old| self.active[old])).collect();
         }
         self.adam.replace(source);
-        self.gradients = GaussianGradients::zeros(&gaussians);
         self.density = empty_statistics(gaussians.len());
         self.gaussians = gaussians;
         Ok(())
