@@ -192,15 +192,17 @@ fn spread_gradient(
     local: &LocalProjection,
 ) -> [DVec3; 2] {
     let (k, s) = (footprint.inverse_conditional, footprint.slope);
-    let by_conditional = -0.5 * gradient.v_dd;
-    let by_slope = k * gradient.v_dy;
+    let by_variance = 0.5 * k * k * gradient.v_dd;
+    let by_slope = footprint.inverse_yy * k * gradient.v_dy;
     let by_yy_alone = 0.5 * gradient.v_yy * footprint.inverse_yy * footprint.inverse_yy;
-    // k = 1 / (xx - xy² / yy) and s = xy / yy.
-    let xx = -k * k * by_conditional;
-    let xy = 2.0 * k * k * s * by_conditional + footprint.inverse_yy * by_slope;
-    let yy = -k * k * s * s * by_conditional - s * footprint.inverse_yy * by_slope + by_yy_alone;
+    // The variance along a row is the square of what is left of `across` besides its share along `along`: written so, no
+    // product of a needle's length with itself has to cancel.
     let [across, along] = local.spread;
-    [across * (2.0 * xx) + along * xy, across * xy + along * (2.0 * yy)]
+    let rest = across - along * s;
+    [
+        rest * (2.0 * by_variance) + along * by_slope,
+        rest * (by_slope - 2.0 * s * by_variance) + along * (2.0 * by_yy_alone - s * by_slope),
+    ]
 }
 
 /// By the mean in camera axes, through the projected mean and through the Jacobian's entries.
