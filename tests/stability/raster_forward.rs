@@ -12,7 +12,7 @@ use crate::{
         render::render,
     },
     row::{Bar, Row, excess},
-    scenes::{Extreme, Scene, extremes, longest, pile, typical},
+    scenes::{Extreme, Scene, extremes, pile, typical},
 };
 
 const BAR: Bar = Bar {
@@ -60,6 +60,6 @@ fn row(extreme: &Extreme) -> Row {
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
     let pile = pile("100 000 Gaussians on one pixel, opacity 0.0039 to 1", 100_000);
-    let all = [typical()].into_iter().chain(extremes()).chain([longest(), pile]);
+    let all = [typical()].into_iter().chain(extremes()).chain([pile]);
     all.map(|extreme| row(&extreme)).collect()
 }

@@ -314,13 +314,17 @@ fn spread_gradient<D: Doubles>(
 ) -> [Vector<D>; 2] {
     let (half, two) = (D::splat(0.5), D::splat(2.0));
     let (k, s, inverse_yy) = (covariance.inverse_conditional, covariance.slope, covariance.inverse_yy);
-    // k = 1 / (xx - xy² / yy) and s = xy / yy.
-    let xx = half * k * k * gradient.v_dd;
+    let by_variance = half * k * k * gradient.v_dd;
     let by_slope = inverse_yy * (k * gradient.v_dy);
-    let xy = by_slope - two * s * xx;
-    let yy = s * (s * xx - by_slope) + half * gradient.v_yy * (inverse_yy * inverse_yy);
+    let by_yy = half * gradient.v_yy * (inverse_yy * inverse_yy);
+    // The variance along a row is the square of what is left of `across` besides its share along `along`: written so, no
+    // product of a needle's length with itself has to cancel.
     let [across, along] = local.spread;
-    [across.scaled_plus(two * xx, along * xy), along.scaled_plus(two * yy, across * xy)]
+    let rest = along.scaled_plus(-s, across);
+    [
+        rest.scaled_plus(two * by_variance, along * by_slope),
+        rest.scaled_plus(by_slope - two * s * by_variance, along * (two * by_yy - s * by_slope)),
+    ]
 }
 
 /// By the mean in camera axes, through the projected mean and through the Jacobian's entries; `rows` is the gradient by
