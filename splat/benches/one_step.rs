@@ -33,8 +33,7 @@ fn main() {
     counted_blend(&mut stages);
     counted_loss(&mut stages);
     counted_blend_backward(&mut stages);
-    counted_project_backward(&mut stages);
-    counted_adam(&mut stages);
+    counted_descend(&mut stages);
 
     let mut session = session(&scene).unwrap_or_else(|error| panic!("a generated scene: {error}"));
     let rates = rates(SIZE.sh_degree);
@@ -66,8 +65,7 @@ counted!(
     counted_blend = blend,
     counted_loss = loss,
     counted_blend_backward = blend_backward,
-    counted_project_backward = project_backward,
-    counted_adam = adam
+    counted_descend = descend
 );
 
 #[inline(never)]

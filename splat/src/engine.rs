@@ -127,6 +127,13 @@ pub struct DensityStatistics {
     pub visible_steps: Vec<u32>,
 }
 
+impl DensityStatistics {
+    /// Of `count` Gaussians before the first step.
+    pub fn zeros(count: usize) -> Self {
+        Self { gradient_norm: vec![0.0; count], visible_steps: vec![0; count] }
+    }
+}
+
 /// Parameters, optimiser state and images kept on a device between steps.
 pub trait Session: Send {
     /// One optimisation step on view `view` of the session's input. A device may still be at work on it afterwards: nothing

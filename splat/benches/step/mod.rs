@@ -4,8 +4,8 @@
 use std::sync::Arc;
 
 use splat::{
-    engine::{Engine, EngineError, Session, SessionInput, TrainingView},
-    gaussians::{Gaussians, gradients::GaussianGradients},
+    engine::{DensityStatistics, Engine, EngineError, Session, SessionInput, TrainingView},
+    gaussians::Gaussians,
     image::Image,
     loss::{LossWorkspace, PhotometricLoss},
     optim::{Adam, LearningRates},
@@ -21,14 +21,13 @@ const DSSIM_WEIGHT: f32 = 0.2;
 pub(crate) type Stage = (&'static str, fn(&mut Stages));
 
 /// The stages in the order of a step.
-pub(crate) const STAGES: [Stage; 7] = [
+pub(crate) const STAGES: [Stage; 6] = [
     ("project", Stages::project),
     ("bin", Stages::bin),
     ("blend", Stages::blend),
     ("loss", Stages::loss),
     ("blend_backward", Stages::blend_backward),
-    ("project_backward", Stages::project_backward),
-    ("adam", Stages::adam),
+    ("descend", Stages::descend),
 ];
 
 /// What the stages of a step work on. A stage may be repeated; its input is what the stages before it left.
@@ -40,8 +39,8 @@ pub(crate) struct Stages {
     loss: PhotometricLoss,
     workspace: LossWorkspace,
     image_gradient: Vec<f32>,
-    gradients: GaussianGradients,
     adam: Adam,
+    density: DensityStatistics,
     order: Vec<u32>,
 }
 
@@ -56,7 +55,7 @@ impl Stages {
             workspace: LossWorkspace::default(),
             image_gradient: vec![0.0; rendered.pixels.len()],
             rendered,
-            gradients: GaussianGradients::zeros(&scene.gaussians),
+            density: DensityStatistics::zeros(scene.gaussians.len()),
             adam: Adam::new(&scene.gaussians),
             order: Vec::new(),
             scene: scene.clone(),
@@ -96,21 +95,11 @@ impl Stages {
         self.pass.blend_backward(&self.scene.camera, BACKGROUND, &self.image_gradient, &[]);
     }
 
-    /// Gradients of the parameters.
-    pub(crate) fn project_backward(&mut self) {
-        self.pass.project_backward(
-            &self.gaussians,
-            &self.scene.camera,
-            self.gaussians.sh_degree,
-            &[],
-            &mut self.gradients,
-        );
-    }
-
-    /// The update.
-    pub(crate) fn adam(&mut self) {
+    /// Gradients of the parameters, and the update.
+    pub(crate) fn descend(&mut self) {
         let rates = rates(self.gaussians.sh_degree);
-        self.adam.step(&mut self.gaussians, &self.gradients, &rates, None);
+        let camera = &self.scene.camera;
+        self.pass.descend(&mut self.gaussians, camera, &rates, &[], &mut self.adam, &mut self.density);
     }
 }
 

@@ -110,3 +110,83 @@ pub(super) fn direction_gradient<S: Simd>([x, y, z]: [S; 3], degree: u32, weight
     }
     [dx.0, dy.0, dz.0]
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::{
+        gaussians::sh,
+        simd::{Instructions, LANES, simd_kernel},
+    };
+
+    type Lanes = [f32; LANES];
+
+    simd_kernel! {
+        fn evaluate(
+            directions: &[Lanes; 3],
+            degree: u32,
+            weights: &[Lanes; MOST],
+            basis_to: &mut [Lanes; MOST],
+            gradient_to: &mut [Lanes; 3],
+        ) = evaluate_kernel
+    }
+
+    #[inline(always)]
+    fn evaluate_kernel<S: Simd>(
+        [x, y, z]: &[Lanes; 3],
+        degree: u32,
+        weights: &[Lanes; MOST],
+        basis_to: &mut [Lanes; MOST],
+        gradient_to: &mut [Lanes; 3],
+    ) {
+        let directions = [S::load(x), S::load(y), S::load(z)];
+        let mut loaded = [S::splat(0.0); MOST];
+        for (loaded, weights) in loaded.iter_mut().zip(weights) {
+            *loaded = S::load(weights);
+        }
+        for (values, to) in basis(directions, degree).into_iter().zip(basis_to) {
+            values.store(to);
+        }
+        for (values, to) in direction_gradient(directions, degree, &loaded).into_iter().zip(gradient_to) {
+            values.store(to);
+        }
+    }
+
+    #[test]
+    fn basis_and_gradient_are_those_of_double_precision() {
+        let direction = |lane: usize| {
+            let angle = 0.7 * lane as f64;
+            DVec3::new(angle.sin(), (1.3 * angle).cos(), 0.2 + (2.1 * angle).sin()).normalize()
+        };
+        let weight = |place: usize, lane: usize| ((3 * place + 5 * lane) as f64).sin();
+        let directions: [Lanes; 3] =
+            std::array::from_fn(|axis| std::array::from_fn(|lane| direction(lane)[axis] as f32));
+        let weights: [Lanes; MOST] =
+            std::array::from_fn(|place| std::array::from_fn(|lane| weight(place, lane) as f32));
+        for instructions in Instructions::available() {
+            for degree in 0..=sh::MAX_DEGREE {
+                let (mut values, mut gradient) = ([[0.0; LANES]; MOST], [[0.0; LANES]; 3]);
+                evaluate(instructions, &directions, degree, &weights, &mut values, &mut gradient);
+                for lane in 0..LANES {
+                    let expected = sh::basis(direction(lane), degree);
+                    for (found, expected) in values.iter().zip(expected) {
+                        // A dozen roundings of numbers up to 3, directions rounded among them.
+                        assert!((f64::from(found[lane]) - expected).abs() < 2e-6, "degree {degree}");
+                    }
+                    let weighted = |at: DVec3| -> f64 {
+                        sh::basis(at, degree).iter().enumerate().map(|(k, b)| b * weight(k, lane)).sum()
+                    };
+                    for axis in 0..3 {
+                        let step = DVec3::AXES[axis] * 1e-5;
+                        let difference = weighted(direction(lane) + step) - weighted(direction(lane) - step);
+                        let (found, expected) = (f64::from(gradient[axis][lane]), difference / 2e-5);
+                        // Sums of up to 16 products of that kind, ten times as large.
+                        assert!((found - expected).abs() < 3e-5, "degree {degree}: {found} {expected}");
+                    }
+                }
+            }
+        }
+    }
+}

@@ -20,6 +20,8 @@ mod descend;
 mod engine;
 mod footprint_moments;
 mod harmonics;
+#[cfg(test)]
+mod lane_tests;
 mod lanes;
 mod local;
 mod pass;

@@ -19,7 +19,7 @@ pub(super) const SUMS: usize = 9;
 pub(super) type GroupSums = [[f64; LANES]; SUMS];
 
 /// Gaussians between one part of the work and the next: what is handed over fits a near cache.
-pub(super) const GRANULE: usize = 256;
+pub(super) const GRANULE: usize = 128;
 
 /// Gaussians whose sums are asked for ahead.
 const AHEAD: usize = 16;

@@ -50,7 +50,7 @@ impl CpuSession {
             .collect();
         Ok(Self {
             adam: Adam::new(&input.gaussians),
-            density: empty_statistics(count),
+            density: DensityStatistics::zeros(count),
             active: input.frozen.iter().map(|frozen| !frozen).collect(),
             gaussians: input.gaussians,
             views,
@@ -106,7 +106,7 @@ impl Session for CpuSession {
     }
 
     fn take_density_statistics(&mut self) -> Result<DensityStatistics, EngineError> {
-        Ok(std::mem::replace(&mut self.density, empty_statistics(self.gaussians.len())))
+        Ok(std::mem::replace(&mut self.density, DensityStatistics::zeros(self.gaussians.len())))
     }
 
     fn replace(&mut self, gaussians: Gaussians, source: &[Option<usize>]) -> Result<(), EngineError> {
@@ -133,12 +133,8 @@ impl Session for CpuSession {
             self.active = source.iter().map(|old| old.is_none_or(|old| self.active[old])).collect();
         }
         self.adam.replace(source);
-        self.density = empty_statistics(gaussians.len());
+        self.density = DensityStatistics::zeros(gaussians.len());
         self.gaussians = gaussians;
         Ok(())
     }
-}
-
-fn empty_statistics(count: usize) -> DensityStatistics {
-    DensityStatistics { gradient_norm: vec![0.0; count], visible_steps: vec![0; count] }
 }
