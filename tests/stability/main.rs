@@ -18,7 +18,7 @@ mod motion;
 
 use motion::{
     footprints as motion_footprints, lift as motion_lift, partial as motion_partial,
-    population as motion_population,
+    population as motion_population, poses, rotation as motion_rotation,
 };
 
 /// A test for every sweep, and the list of them.
@@ -37,4 +37,4 @@ macro_rules! sweeps {
 }
 
 // In the order of a training step.
-sweeps! { motion_footprints, motion_lift, motion_partial, motion_population, metrics }
+sweeps! { poses, motion_footprints, motion_lift, motion_partial, motion_rotation, motion_population, metrics }
