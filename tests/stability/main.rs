@@ -13,8 +13,17 @@ mod document;
 mod reference;
 mod row;
 
+mod adam;
+mod harmonics;
+mod loss;
 mod metrics;
 mod motion;
+mod raster_backward;
+mod raster_forward;
+mod raster_input;
+mod scenes;
+mod session;
+mod storage;
 
 use motion::{
     footprints as motion_footprints, lift as motion_lift, partial as motion_partial,
@@ -36,5 +45,21 @@ macro_rules! sweeps {
     };
 }
 
-// In the order of a training step.
-sweeps! { poses, motion_footprints, motion_lift, motion_partial, motion_rotation, motion_population, metrics }
+// In the order of a training step, then of motion compensation.
+sweeps! {
+    raster_forward,
+    raster_backward,
+    raster_input,
+    loss,
+    adam,
+    session,
+    harmonics,
+    storage,
+    metrics,
+    poses,
+    motion_footprints,
+    motion_lift,
+    motion_partial,
+    motion_rotation,
+    motion_population,
+}

@@ -10,7 +10,7 @@ use crate::{
         ROUNDOFF_64,
         ssim::{Mean, Pair},
     },
-    row::{Bar, Row},
+    row::{Bar, EXACT, Row},
 };
 
 const SSIM_BAR: Bar = Bar {
@@ -24,16 +24,16 @@ const PSNR_BAR: Bar =
         unit: "dB", factor: 2.0, why: "2⁻⁵³ (4.3 dB × one rounding per term, and one of the result)"
     };
 
-fn image(width: u32, height: u32, value: impl Fn(usize) -> f32) -> Image {
+pub(crate) fn image(width: u32, height: u32, value: impl Fn(usize) -> f32) -> Image {
     Image { width, height, pixels: (0..(3 * width * height) as usize).map(value).collect() }
 }
 
-fn texture(width: u32, height: u32, phase: f32) -> Image {
+pub(crate) fn texture(width: u32, height: u32, phase: f32) -> Image {
     image(width, height, |index| 0.5 + 0.4 * (index as f32 * 0.37 + phase).sin())
 }
 
 /// Flat, black, equal, nearly equal, opposite images of a size.
-fn pairs(width: u32, height: u32) -> Vec<(Image, Image)> {
+pub(crate) fn pairs(width: u32, height: u32) -> Vec<(Image, Image)> {
     let flat = |value: f32| image(width, height, |_| value);
     let texture = |phase: f32| texture(width, height, phase);
     vec![
@@ -48,8 +48,8 @@ fn pairs(width: u32, height: u32) -> Vec<(Image, Image)> {
     ]
 }
 
-const SMALL: [(u32, u32); 6] = [(1, 1), (2, 3), (5, 5), (1, 11), (10, 10), (17, 13)];
-const LONG: [(u32, u32); 2] = [(1, 4096), (8192, 1)];
+pub(crate) const SMALL: [(u32, u32); 6] = [(1, 1), (2, 3), (5, 5), (1, 11), (10, 10), (17, 13)];
+pub(crate) const LONG: [(u32, u32); 2] = [(1, 4096), (8192, 1)];
 
 fn ssim_row(extreme: &'static str, sizes: &[(u32, u32)]) -> Row {
     let mut row = Row::new("metrics: SSIM", extreme, SSIM_BAR);
@@ -73,11 +73,26 @@ fn psnr_row() -> Row {
     row
 }
 
+/// What cannot be compared scores nothing.
+fn refusals() -> Row {
+    let mut row =
+        Row::new("metrics: PSNR, SSIM", "other sizes, empty images, a NaN in either", EXACT).remark("NaN");
+    let whole = texture(4, 4, 0.0);
+    let mut broken = whole.clone();
+    broken.pixels[7] = f32::NAN;
+    let empty = image(0, 0, |_| 0.0);
+    for (a, b) in [(&whole, &texture(4, 5, 0.0)), (&empty, &empty), (&whole, &broken), (&broken, &whole)] {
+        row.exact(psnr(a, b).is_nan() && ssim(a, b).is_nan());
+    }
+    row
+}
+
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
     vec![
         ssim_row("flat, black and tiny images, 1×1 to 17×13", &SMALL),
         ssim_row("one column of 4096, one row of 8192 pixels", &LONG),
         psnr_row(),
+        refusals(),
     ]
 }

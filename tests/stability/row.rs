@@ -11,6 +11,9 @@ pub(crate) struct Bar {
     pub why: &'static str,
 }
 
+/// Nothing but equality, or the stated refusal, will do.
+pub(crate) const EXACT: Bar = Bar { unit: "", factor: 1.0, why: "as stated, bit for bit" };
+
 /// One stage at one extreme: the worst of its cases, and whether that is good enough.
 #[derive(Clone, Debug)]
 pub(crate) struct Row {
@@ -20,9 +23,11 @@ pub(crate) struct Row {
     pub extreme: &'static str,
     /// Number of cases.
     pub cases: usize,
-    /// Error of the worst case.
+    /// Largest error of all.
+    pub largest: f64,
+    /// The error that comes nearest to its bound, or is farthest beyond it.
     pub error: f64,
-    /// What first-order propagation of rounding or noise predicts for that case.
+    /// What first-order propagation of rounding or noise predicts for that one.
     pub predicted: f64,
     /// What the error is held to.
     pub bar: Bar,
@@ -33,7 +38,16 @@ pub(crate) struct Row {
 impl Row {
     /// A row without cases, which does not hold.
     pub(crate) fn new(stage: &'static str, extreme: &'static str, bar: Bar) -> Self {
-        Self { stage, extreme, cases: 0, error: 0.0, predicted: 0.0, bar, remark: String::new() }
+        Self {
+            stage,
+            extreme,
+            cases: 0,
+            largest: 0.0,
+            error: 0.0,
+            predicted: 0.0,
+            bar,
+            remark: String::new(),
+        }
     }
 
     /// With a remark for the table.
@@ -42,14 +56,21 @@ impl Row {
         self
     }
 
-    /// Adds a case. The row keeps the one that comes nearest to its bound or is farthest beyond it; an error that is
-    /// no number is beyond every bound. A prediction of zero allows no error at all.
+    /// Adds a case. An error that is no number is beyond every bound; a prediction of zero allows no error at all.
     pub(crate) fn case(&mut self, error: f64, predicted: f64) {
+        self.case_of([(error, predicted)]);
+    }
+
+    /// Adds a case of many values, each with its error and its prediction.
+    pub(crate) fn case_of(&mut self, values: impl IntoIterator<Item = (f64, f64)>) {
         self.cases += 1;
-        let is_worse =
-            self.cases == 1 || self.excess(error, predicted) > self.excess(self.error, self.predicted);
-        if is_worse {
-            (self.error, self.predicted) = (error, predicted);
+        for (error, predicted) in values {
+            if !(error <= self.largest) {
+                self.largest = error;
+            }
+            if self.excess(error, predicted) > self.excess(self.error, self.predicted) {
+                (self.error, self.predicted) = (error, predicted);
+            }
         }
     }
 
@@ -58,7 +79,7 @@ impl Row {
         self.case(if is_right { 0.0 } else { 1.0 }, 0.0);
     }
 
-    /// Error that the worst case may have.
+    /// What the kept error is held to.
     pub(crate) fn bound(&self) -> f64 {
         self.bar.factor * self.predicted
     }
@@ -78,6 +99,12 @@ impl Row {
     }
 }
 
+/// Whether errors come nearer to their predictions than others do.
+pub(crate) fn excess(values: &[(f64, f64)]) -> f64 {
+    let ratio = |&(error, predicted): &(f64, f64)| if error == 0.0 { 0.0 } else { error / predicted };
+    values.iter().map(ratio).fold(0.0, |worst, ratio| if ratio <= worst { worst } else { ratio })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -93,7 +120,7 @@ mod tests {
     #[test]
     fn the_case_nearest_to_its_bound_is_kept() {
         let row = row(&[(1.0, 10.0), (0.5, 1.0), (3.0, 100.0)]);
-        assert_eq!((row.cases, row.error, row.bound()), (3, 0.5, 2.0));
+        assert_eq!((row.cases, row.error, row.bound(), row.largest), (3, 0.5, 2.0, 3.0));
         assert!(row.holds());
     }
 

@@ -24,6 +24,7 @@ struct Row {
     extreme: String,
     cases: u64,
     /// None if it is no number.
+    largest: Option<f64>,
     error: Option<f64>,
     unit: String,
     bound: Option<f64>,
@@ -89,22 +90,21 @@ fn filled(document: &str, rows: impl Fn(&str) -> Result<Vec<Row>>) -> Result<Str
 
 fn table(rows: &[Row]) -> Result<String> {
     let mut table = String::from(
-        "\n| stage | extreme | cases | worst error | bound | factor × prediction | remark |\n\
+        "\n| stage | extreme | cases | largest error | nearest to its bound | bound = factor × prediction | remark |\n\
          |---|---|---:|---:|---:|---|---|\n",
     );
     for row in rows {
         let Row { stage, extreme, cases, unit, factor, why, remark, .. } = row;
-        let (error, bound) = (number(row.error), number(row.bound));
         let remark = if row.holds { remark.clone() } else { format!("**does not hold** {remark}") };
         let cells = format!("{stage}{extreme}{unit}{why}{remark}");
         ensure!(!cells.contains(['|', '\n']), "{stage}, {extreme}: a cell holds `|` or ends its line");
-        let error = if row.bound == Some(0.0) && row.error == Some(0.0) { "none".into() } else { error };
-        let (error, bound) =
-            (format!("{error} {unit}"), if bound == "0.0e0" { "exact".into() } else { bound });
-        writeln!(
-            table,
-            "| {stage} | {extreme} | {cases} | {error} | {bound} | {factor} × {why} | {remark} |"
-        )?;
+        let nearest = format!("{} of {}", number(row.error), number(row.bound));
+        let (largest, nearest) = match row.largest {
+            Some(0.0) => ("none".into(), "exact".into()),
+            largest => (format!("{} {unit}", number(largest)), nearest),
+        };
+        let bound = if unit.is_empty() { why.clone() } else { format!("{factor} × {why}") };
+        writeln!(table, "| {stage} | {extreme} | {cases} | {largest} | {nearest} | {bound} | {remark} |")?;
     }
     table.push('\n');
     Ok(table)
@@ -112,4 +112,55 @@ fn table(rows: &[Row]) -> Result<String> {
 
 fn number(value: Option<f64>) -> String {
     value.map_or("no number".into(), |value| format!("{value:.1e}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DOCUMENT: &str = "before\n<!-- rows of one -->\nOLD\n<!-- end of rows -->\nafter\n";
+
+    fn row(error: f64, holds: bool) -> Row {
+        Row {
+            stage: "stage".into(),
+            extreme: "extreme".into(),
+            cases: 3,
+            largest: Some(2.0 * error),
+            error: Some(error),
+            unit: "pixel".into(),
+            bound: Some(1e-3),
+            factor: 2.0,
+            why: "rounding".into(),
+            remark: String::new(),
+            holds,
+        }
+    }
+
+    #[test]
+    fn tables_are_renewed_and_the_rest_stays() {
+        let text = filled(DOCUMENT, |_| Ok(vec![row(2e-4, true), row(5e-2, false)])).expect("a document");
+        assert!(text.starts_with("before\n<!-- rows of one -->\n\n| stage |"), "{text}");
+        assert!(text.ends_with("\n<!-- end of rows -->\nafter\n"), "{text}");
+        assert!(!text.contains("OLD"), "{text}");
+        assert!(
+            text.contains("| stage | extreme | 3 | 4.0e-4 pixel | 2.0e-4 of 1.0e-3 | 2 × rounding |  |"),
+            "{text}"
+        );
+        assert_eq!(text.matches("**does not hold**").count(), 1, "{text}");
+        assert_eq!(filled(&text, |_| Ok(vec![row(2e-4, true), row(5e-2, false)])).expect("again"), text);
+    }
+
+    #[test]
+    fn documents_and_rows_that_make_no_table_are_refused() {
+        assert!(filled("<!-- rows of one -->\nOLD\n", |_| Ok(Vec::new())).is_err(), "no end");
+        assert!(filled(DOCUMENT, |_| bail!("no rows")).is_err(), "no rows");
+        let broken = || Row { remark: "a | b".into(), ..row(0.0, true) };
+        assert!(filled(DOCUMENT, |_| Ok(vec![broken()])).is_err(), "a cell in two");
+    }
+
+    #[test]
+    fn what_is_no_number_says_so() {
+        let broken = Row { error: None, largest: None, ..row(0.0, false) };
+        assert!(table(&[broken]).expect("a table").contains("no number of 1.0e-3"));
+    }
 }

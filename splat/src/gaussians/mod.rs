@@ -109,7 +109,8 @@ impl Gaussians {
 pub fn normalised_rotation(stored: [f32; 4]) -> DQuat {
     let [w, x, y, z] = stored.map(f64::from);
     let largest = w.abs().max(x.abs()).max(y.abs()).max(z.abs());
-    if !(largest > 0.0 && largest.is_finite()) {
+    // A maximum passes over NaN, a sum does not.
+    if !(largest > 0.0 && (w + x + y + z).is_finite()) {
         return DQuat::IDENTITY;
     }
     DQuat::from_xyzw(x / largest, y / largest, z / largest, w / largest).normalize()
@@ -127,4 +128,27 @@ pub fn sigmoid(x: f64) -> f64 {
 /// Inverse of [`sigmoid`] for `p` in `(0, 1)`.
 pub fn logit(p: f64) -> f64 {
     (p / (1.0 - p)).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quaternions_without_direction_do_not_rotate() {
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for place in 0..4 {
+                let mut stored = [0.1, 0.2, 0.3, 0.4];
+                stored[place] = value;
+                assert_eq!(normalised_rotation(stored), DQuat::IDENTITY, "{stored:?}");
+            }
+        }
+        assert_eq!(normalised_rotation([0.0, -0.0, 0.0, 0.0]), DQuat::IDENTITY);
+        assert_eq!(normalised_rotation([f32::INFINITY, f32::NEG_INFINITY, 0.0, 0.0]), DQuat::IDENTITY);
+        assert_eq!(normalised_rotation([f32::MAX, 0.0, 0.0, 0.0]), DQuat::IDENTITY);
+        assert_eq!(
+            normalised_rotation([0.0, f32::from_bits(1), 0.0, 0.0]),
+            DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0)
+        );
+    }
 }

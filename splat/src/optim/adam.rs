@@ -73,7 +73,8 @@ impl Adam {
 
     /// One descent step. Gaussians that are not `active` keep their parameters and moments, and so do harmonics above
     /// `rates.sh_degree`. The bias correction counts all steps of this optimiser, also for Gaussians that joined
-    /// later, as in the original 3D Gaussian Splatting. The same bytes for every number of threads.
+    /// later, as in the original 3D Gaussian Splatting. A parameter whose gradient is so large that its square overflows,
+    /// beyond 1e19, takes no step, then or later. The same bytes for every number of threads.
     ///
     /// # Panics
     /// If Gaussians, gradients or `active` differ in size from the set this state was made for.

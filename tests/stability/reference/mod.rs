@@ -2,6 +2,11 @@
 //!
 //! Nothing here calls the code under test.
 
+pub(crate) mod blend;
+pub(crate) mod gradient;
+pub(crate) mod project;
+pub(crate) mod real;
+pub(crate) mod render;
 pub(crate) mod ssim;
 
 /// Unit roundoff of single precision.
