@@ -27,7 +27,7 @@ mod storage;
 
 use motion::{
     footprints as motion_footprints, lift as motion_lift, partial as motion_partial,
-    population as motion_population,
+    population as motion_population, poses, rotation as motion_rotation,
 };
 
 /// A test for every sweep, and the list of them.
@@ -45,8 +45,21 @@ macro_rules! sweeps {
     };
 }
 
-// In the order of a training step.
+// In the order of a training step, then of motion compensation.
 sweeps! {
-    raster_forward, raster_backward, raster_input, loss, adam, session, harmonics, storage, metrics,
-    motion_footprints, motion_lift, motion_partial, motion_population,
+    raster_forward,
+    raster_backward,
+    raster_input,
+    loss,
+    adam,
+    session,
+    harmonics,
+    storage,
+    metrics,
+    poses,
+    motion_footprints,
+    motion_lift,
+    motion_partial,
+    motion_rotation,
+    motion_population,
 }

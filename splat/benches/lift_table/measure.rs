@@ -7,7 +7,9 @@ use glam::{DQuat, DVec3};
 use serde::Serialize;
 use splat::{
     gaussians::Gaussians,
-    motion::{self, LiftMethod, MotionField, OrderCounts, MotionOrigin, MotionSettings, MotionView, reference},
+    motion::{
+        self, LiftMethod, MotionField, MotionOrigin, MotionSettings, MotionView, OrderCounts, reference,
+    },
 };
 
 use super::{

@@ -11,7 +11,10 @@ use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::Gaussians,
-    motion::{self, MotionOrigin, MotionSettings, MotionStage, MotionView, moments::FootprintMoments, reweighting::Reweighting},
+    motion::{
+        self, MotionOrigin, MotionSettings, MotionStage, MotionView, moments::FootprintMoments,
+        reweighting::Reweighting,
+    },
     raster::CpuEngine,
     tracking::TrackField,
 };

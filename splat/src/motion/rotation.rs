@@ -76,6 +76,13 @@ pub(super) fn fit_rigid_motion(
     let mut motion = unturned;
     let mut stage = 0;
     let mut system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
+    if let Some(rotation) = turn_of_axes(axes) {
+        let turned = RigidMotion { rotation, ..unturned };
+        let from_there = System::new(members, axes, &turned, BODY_STRAIN[stage], spacing, settings);
+        if from_there.cost(&turned) < system.cost(&unturned) {
+            (motion, system) = (turned, from_there);
+        }
+    }
     for _ in 0..STEPS {
         let (translation, turn) = system.solve();
         let turn = turn.clamp_length_max(LONGEST_STEP);
@@ -99,6 +106,20 @@ pub(super) fn fit_rigid_motion(
     let kept = 1.0 - settings.rotation_significance.powi(2) / chi_squared.max(f64::MIN_POSITIVE);
     let rotation = if kept > 0.0 { DQuat::from_scaled_axis(turn * kept) } else { DQuat::IDENTITY };
     RigidMotion { rotation, ..motion }
+}
+
+/// The rotation that takes two axes to where they are seen, each bent as much as the other to keep their angle.
+///
+/// A start on the right side: tilted discs that few views see look almost like their mirror images, and no small
+/// steps lead from one to the other.
+fn turn_of_axes(axes: &[TurnedAxis]) -> Option<DQuat> {
+    let [a, b] = axes else { return None };
+    let frame = |a: DVec3, b: DVec3| {
+        let (along, across) = ((a + b).try_normalize()?, (a - b).try_normalize()?);
+        Some(DMat3::from_cols(along, across, along.cross(across)))
+    };
+    let turn = frame(a.to, b.to)? * frame(a.from, b.from)?.transpose();
+    Some(DQuat::from_mat3(&turn).normalize()).filter(|turn| turn.is_finite())
 }
 
 /// Normal equations of the increments of translation and rotation vector, by 3×3 blocks.
@@ -164,6 +185,11 @@ impl System {
         // lowers the estimated misfit where it is ill determined anyway.
         self.freedom += 3.0 * weight;
         coupling
+    }
+
+    /// What `motion`, at which this was set up, costs.
+    fn cost(&self, motion: &RigidMotion) -> f64 {
+        self.chi_squared + self.prior * motion.rotation.to_scaled_axis().length_squared()
     }
 
     /// Inverse of the translation block; a tiny share of its trace stands in where no member sees a

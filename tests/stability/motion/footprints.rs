@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 
 use glam::{DQuat, DVec3};
 use rand::RngExt;
-use splat::{gaussians::Gaussians, motion::MotionSettings};
+use splat::{gaussians::Gaussians, motion::MotionSettings, tracking::TrackField};
 
 use super::{
     judge::{LIFT, Origins, judge_all},
@@ -15,7 +15,7 @@ use super::{
 use crate::row::Row;
 
 /// Lone Gaussians per row.
-const CASES: u64 = 30;
+const CASES: u64 = 20;
 
 /// The usual rig before a smaller image; a pixel of it is four of the rig's.
 const PIXEL: f64 = 4.0;
@@ -112,7 +112,86 @@ fn noises() -> Vec<Row> {
     ]
 }
 
+/// Tracks that are no positions: every pixel of every view, or a share of them.
+fn invalid_tracks() -> Vec<Row> {
+    let spoilt = |extreme: &'static str, share: f64, spoil: fn(&mut TrackField, usize)| {
+        row(extreme, move |seed| {
+            let wall = Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed);
+            wall.with_tracks(|view, tracks| {
+                let mut random = random(seed ^ ((view as u64) << 32));
+                for pixel in 0..tracks.positions.len() {
+                    if random.random_range(0.0..1.0) < share {
+                        spoil(tracks, pixel);
+                    }
+                }
+            })
+        })
+    };
+    let nan = |tracks: &mut TrackField, pixel: usize| tracks.positions[pixel] = [f32::NAN; 2];
+    let infinite = |tracks: &mut TrackField, pixel: usize| tracks.positions[pixel][1] = f32::NEG_INFINITY;
+    let far = |tracks: &mut TrackField, pixel: usize| tracks.positions[pixel] = [f32::MAX, -f32::MAX];
+    let sigma = [
+        |tracks: &mut TrackField, pixel: usize| tracks.sigma[pixel] = f32::NAN,
+        |tracks: &mut TrackField, pixel: usize| tracks.sigma[pixel] = f32::INFINITY,
+        |tracks: &mut TrackField, pixel: usize| tracks.sigma[pixel] = 0.0,
+        |tracks: &mut TrackField, pixel: usize| tracks.sigma[pixel] = -1.0,
+    ];
+    let [sigma_nan, sigma_infinite, sigma_zero, sigma_negative] = sigma;
+    vec![
+        spoilt("all pixels invisible", 1.0, |tracks, pixel| tracks.visible[pixel] = false),
+        spoilt("30 % of the pixels invisible", 0.3, |tracks, pixel| tracks.visible[pixel] = false),
+        spoilt("all tracks NaN, claimed visible", 1.0, nan),
+        spoilt("30 % of the tracks NaN, claimed visible", 0.3, nan),
+        spoilt("all tracks infinite, claimed visible", 1.0, infinite),
+        spoilt("30 % of the tracks infinite, claimed visible", 0.3, infinite),
+        spoilt("all tracks at the largest numbers, claimed visible", 1.0, far),
+        spoilt("all standard deviations NaN", 1.0, sigma_nan),
+        spoilt("all standard deviations infinite", 1.0, sigma_infinite),
+        spoilt("all standard deviations zero", 1.0, sigma_zero),
+        spoilt("all standard deviations negative", 1.0, sigma_negative),
+        spoilt("all standard deviations 1e-45 px", 1.0, |tracks, pixel| tracks.sigma[pixel] = 1e-45),
+        row("all standard deviations 1e38 px", |seed| {
+            Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed).claiming(1e38)
+        }),
+    ]
+}
+
+fn outliers() -> Vec<Row> {
+    let wrong = |extreme: &'static str, share: f64| {
+        row(extreme, move |seed| {
+            let wall = Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed);
+            wall.with_noise(0.1, 1, seed).with_outliers(share, seed)
+        })
+    };
+    vec![
+        wrong("wrong tracks on 10 % of the pixels", 0.1),
+        wrong("wrong tracks on 30 % of the pixels", 0.3),
+        wrong("wrong tracks on 50 % of the pixels", 0.5),
+        wrong("wrong tracks on 70 % of the pixels", 0.7),
+    ]
+}
+
+/// World scale and origin, fields of view and views, as the real engine sees them.
+fn geometry() -> Vec<Row> {
+    let usual = Rig::USUAL;
+    let of = |extreme: &'static str, rig: Rig| {
+        row(extreme, move |seed| Wall::new(on_wall(rig, [1.5, 1.0], seed), rig, seed))
+    };
+    vec![
+        of("world units 1e-7 of the usual", Rig { distance: 4e-7, ..usual })
+            .remark("all unsolved: before the rasterizer's near plane at 0.01 world units"),
+        of("world units 1e-2 of the usual", Rig { distance: 4e-2, ..usual }),
+        of("world units 1e4 of the usual", Rig { distance: 4e4, ..usual }),
+        of("world origin 1e3 away", Rig { target: DVec3::new(0.0, -0.6, 0.8) * 1e3, ..usual }),
+        of("world origin 1e6 away", Rig { target: DVec3::new(0.0, -0.6, 0.8) * 1e6, ..usual }),
+        of("field of view 2°", Rig { fov_degrees: 2.0, ..usual }),
+        of("field of view 120°", Rig { fov_degrees: 120.0, ..usual }),
+        of("field of view 170°", Rig { fov_degrees: 170.0, ..usual }),
+        of("64 views", Rig { views: 64, ..usual }),
+    ]
+}
+
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
-    [sizes(), parameters(), noises()].concat()
+    [sizes(), parameters(), geometry(), noises(), invalid_tracks(), outliers()].concat()
 }

@@ -137,7 +137,10 @@ fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize,
     let prediction = predict(&sights, truth);
     // Wrong views are among the cameras; views that do not see the Gaussian have no say.
     let wrong = scene.cameras().iter().filter(|camera| scene.has_outlier(mean, camera)).count();
-    let demand = demand(prediction.as_ref(), sights.len() + wrong, settings);
+    let demand = match demand(prediction.as_ref(), sights.len() + wrong, settings) {
+        Demand::Solved if !scene.is_answerable() => Demand::Either,
+        demand => demand,
+    };
     let error = (mean + field.translation[index] - truth).length();
     match (field.origin[index], prediction) {
         (MotionOrigin::Solved, Some(prediction)) if demand != Demand::Fallback => {

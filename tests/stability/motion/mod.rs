@@ -5,9 +5,10 @@ mod judge;
 pub(crate) mod lift;
 pub(crate) mod partial;
 pub(crate) mod population;
+pub(crate) mod poses;
 mod prescribed;
-#[cfg(test)]
 mod properties;
 mod reference;
+pub(crate) mod rotation;
 mod scene;
 mod wall;

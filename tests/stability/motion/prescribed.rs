@@ -25,6 +25,8 @@ const REACH: f64 = 1.5;
 /// One tracked point of a Gaussian.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sample {
+    /// In the world, before the motion; not known of pixels.
+    pub point: DVec3,
     /// Blending weight times pixels.
     pub weight: f64,
     pub from: DVec2,
@@ -58,7 +60,11 @@ pub(super) trait Tracked {
     fn noise(&self) -> Noise;
     /// Whether the track of the Gaussian at `mean` is wrong in this view.
     fn has_outlier(&self, mean: DVec3, camera: &Camera) -> bool;
-    /// The tracked points of a Gaussian in one view, with the noise of the tracks or without.
+    /// Whether most tracked points of the right views are right, so that falling back is not called for.
+    fn is_answerable(&self) -> bool {
+        true
+    }
+    /// The rightly tracked points of a Gaussian in one view, with the noise of the tracks or without.
     fn samples(&self, index: usize, camera: &Camera, is_noisy: bool) -> Vec<Sample>;
 }
 
@@ -181,6 +187,7 @@ fn sampled(
             let from = camera.project_world(point);
             let to = camera.project_world(motion.of(point)).map(|exact| exact + lost + error);
             Sample {
+                point,
                 weight: (-0.5 * at.length_squared()).exp(),
                 from: from.unwrap_or_default(),
                 to: to.unwrap_or_default(),

@@ -40,16 +40,19 @@ fn errors(gaussians: &Gaussians, cameras: &[Camera], motion: Rigid, field: &Moti
 }
 
 /// Asserts the bar on the average over the solved Gaussians, that three times the bar holds for nine of ten, and that
-/// most are solved.
-fn assert_recovered(errors: &[(f64, f64)], count: usize) -> Result<(), TestCaseError> {
-    prop_assert!(errors.len() * 10 >= count * 8, "{} of {count} solved", errors.len());
+/// most of those that do not rest are solved.
+fn assert_recovered(errors: &[(f64, f64)], field: &MotionField) -> Result<(), TestCaseError> {
+    let moving = field.origin.iter().filter(|&&origin| origin != MotionOrigin::Static).count();
+    prop_assert!(errors.len() * 10 >= moving * 7, "{} of {moving} solved", errors.len());
+    if errors.is_empty() {
+        return Ok(());
+    }
     let share = |of: fn(&(f64, f64)) -> f64| {
         let mut values: Vec<f64> = errors.iter().map(of).collect();
         values.sort_by(f64::total_cmp);
         (values.iter().sum::<f64>() / values.len() as f64, values[values.len() * 9 / 10])
     };
     let ((mean, ninth), (turn, ninth_turn)) = (share(|e| e.0), share(|e| e.1));
-    println!("RIGID {mean:.2e} {ninth:.2e} of the extent, {turn:.4} {ninth_turn:.4} degrees");
     prop_assert!(mean < MEAN_ERROR, "mean error {mean} of the extent");
     prop_assert!(ninth < 3.0 * MEAN_ERROR, "nine of ten within {ninth} of the extent");
     prop_assert!(turn < ROTATION_ERROR, "rotation error {turn} degrees");
@@ -154,10 +157,7 @@ proptest! {
         let field =
             estimate(&Prescribed(&scene), &scene.gaussians, &scene.views(), &MotionSettings::default()).unwrap();
         prop_assert!(is_sound(&field, scene.gaussians.len()));
-        let moving = field.origin.iter().filter(|&&origin| origin != MotionOrigin::Static).count();
-        if moving == scene.gaussians.len() {
-            assert_recovered(&errors(&scene.gaussians, &scene.cameras, scene.motion, &field), moving)?;
-        }
+        assert_recovered(&errors(&scene.gaussians, &scene.cameras, scene.motion, &field), &field)?;
     }
 
     #[test]
@@ -170,7 +170,7 @@ proptest! {
         let wall = Wall::moving(gaussians, rig, motion);
         let field = wall.estimate();
         prop_assert!(is_sound(&field, 150));
-        assert_recovered(&errors(&wall.gaussians, &wall.cameras, motion, &field), 150)?;
+        assert_recovered(&errors(&wall.gaussians, &wall.cameras, motion, &field), &field)?;
     }
 
     #[test]

@@ -2,10 +2,10 @@
 //! propagation predicts of its error.
 
 use glam::{DVec2, DVec3};
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 use splat::{cameras::Camera, motion::MotionSettings};
 
-use super::prescribed::{Noise, Sample, Tracked};
+use super::prescribed::{Noise, Sample, Scene, Tracked, major_axes};
 
 /// Where one view sees the Gaussian go.
 #[derive(Clone, Copy, Debug)]
@@ -166,4 +166,32 @@ fn covariances(sights: &[Sight<'_>], at: DVec3) -> (Matrix3<f64>, Matrix3<f64>) 
         * eigen.eigenvectors.transpose()
         / scale;
     (inverse * spread * inverse, inverse)
+}
+
+/// Standard deviation in radians of the rotation that least squares on every tracked point of a Gaussian gives, its
+/// translation free as well. Points err by the noise of the tracks and by a share of the footprint's size.
+pub(super) fn rotation_deviation(scene: &Scene, index: usize, share: f64) -> Option<f64> {
+    let centre = scene.motion.of(scene.gaussians.mean(index));
+    let (mut normal, mut spread) = (Matrix6::zeros(), Matrix6::zeros());
+    // Rotations about the mean in units that make both halves of the unknowns alike.
+    let size = major_axes(&scene.gaussians, index)[0].length();
+    for camera in scene.cameras() {
+        let samples = scene.samples(index, camera, false);
+        let pixels_per_unit = camera.fx / camera.to_camera(centre).z;
+        let variance = scene.noise.deviation().powi(2) + (share * size * pixels_per_unit).powi(2);
+        for sample in samples.iter().filter(|sample| sample.is_visible) {
+            let point = scene.motion.of(sample.point);
+            let lever = (point - centre) / size;
+            for row in camera.world_jacobian(camera.to_camera(point)) {
+                let turn = lever.cross(row);
+                let row = Vector6::new(row.x, row.y, row.z, turn.x, turn.y, turn.z);
+                normal += row * row.transpose() * sample.weight;
+                spread += row * row.transpose() * sample.weight * sample.weight * variance;
+            }
+        }
+    }
+    let inverse = normal.try_inverse()?;
+    let covariance = inverse * spread * inverse;
+    let turn = covariance.fixed_view::<3, 3>(3, 3).trace().sqrt() / size;
+    turn.is_finite().then_some(turn)
 }

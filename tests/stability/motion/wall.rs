@@ -27,12 +27,14 @@ pub(super) const HEIGHT: u32 = 120;
 pub(super) struct Wall {
     pub gaussians: Gaussians,
     pub cameras: Vec<Camera>,
-    pub centre: DVec3,
     pub motion: Rigid,
     pub noise: Noise,
     /// Tracks of each camera.
     exact: Vec<Arc<TrackField>>,
     tracks: Vec<Arc<TrackField>>,
+    /// Share of the pixels whose tracks are wrong, and which they are, by view.
+    outliers: f64,
+    is_wrong: Vec<Vec<bool>>,
 }
 
 impl Wall {
@@ -49,7 +51,9 @@ impl Wall {
         let exact: Vec<Arc<TrackField>> =
             cameras.iter().map(|camera| Arc::new(tracks(camera, rig.target, motion))).collect();
         let noise = Noise::Independent(0.0);
-        Self { gaussians, cameras, centre: rig.target, motion, noise, tracks: exact.clone(), exact }
+        let is_wrong = vec![vec![false; (WIDTH * HEIGHT) as usize]; cameras.len()];
+        let tracks = exact.clone();
+        Self { gaussians, cameras, motion, noise, exact, tracks, outliers: 0.0, is_wrong }
     }
 
     /// With what `change` makes of each view's tracks.
@@ -78,6 +82,29 @@ impl Wall {
                 *position = [0, 1].map(|axis| position[axis] + (error[axis] * deviation) as f32);
             }
         })
+    }
+
+    /// With tracks that claim this standard deviation, as large as it is.
+    pub(super) fn claiming(mut self, sigma: f32) -> Self {
+        self.noise = Noise::Independent(sigma.into());
+        self.with_tracks(|_, tracks| tracks.sigma.fill(sigma))
+    }
+
+    /// With tracks that lead anywhere on this share of the pixels.
+    pub(super) fn with_outliers(mut self, share: f64, seed: u64) -> Self {
+        self.outliers = share;
+        for (view, is_wrong) in self.is_wrong.iter_mut().enumerate() {
+            let mut random = random(seed ^ ((view as u64) << 40));
+            let tracks = Arc::make_mut(&mut self.tracks[view]);
+            for (is_wrong, position) in is_wrong.iter_mut().zip(&mut tracks.positions) {
+                *is_wrong = random.random_range(0.0..1.0) < share;
+                if *is_wrong {
+                    *position =
+                        [random.random_range(0.0..WIDTH as f32), random.random_range(0.0..HEIGHT as f32)];
+                }
+            }
+        }
+        self
     }
 
     pub(super) fn estimate(&self) -> MotionField {
@@ -144,6 +171,10 @@ impl Tracked for Wall {
         false
     }
 
+    fn is_answerable(&self) -> bool {
+        self.outliers < 0.5
+    }
+
     /// Every pixel on which the Gaussian has at least 1/255 of opacity.
     fn samples(&self, index: usize, camera: &Camera, is_noisy: bool) -> Vec<Sample> {
         let view = self.cameras.iter().position(|other| other == camera).expect("one of the wall's cameras");
@@ -161,6 +192,9 @@ impl Tracked for Wall {
         );
         let conic = footprint.inverse();
         let sample = |pixel: usize| {
+            if is_noisy && self.is_wrong[view][pixel] {
+                return None;
+            }
             let offset = pixel_centre(pixel, camera.width) - mean;
             let alpha = self.gaussians.opacity(index) * (-0.5 * offset.dot(conic * offset)).exp();
             if alpha < f64::from(ALPHA_MIN) {
@@ -170,7 +204,7 @@ impl Tracked for Wall {
             let sigma = tracks.sigma[pixel];
             let is_visible = tracks.visible[pixel] && to.is_finite() && sigma.is_finite() && sigma > 0.0;
             let from = mean + offset;
-            Some(Sample { weight: alpha.min(ALPHA_MAX.into()), from, to, is_visible })
+            Some(Sample { point: DVec3::NAN, weight: alpha.min(ALPHA_MAX.into()), from, to, is_visible })
         };
         (0..tracks.positions.len()).filter_map(sample).collect()
     }
