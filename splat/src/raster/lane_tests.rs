@@ -127,7 +127,7 @@ fn stepped(
         pass.project(&gaussians, &cameras[view], RATES.sh_degree);
         pass.bin(&cameras[view], &mut Vec::new());
         pass.blend(&cameras[view], BLACK, active, &mut image, &mut []);
-        pass.blend_backward(BLACK, &seeds(3 * 70 * 45), &[]);
+        pass.blend_backward(&cameras[view], BLACK, &seeds(3 * 70 * 45), &[]);
         step(&mut pass, &mut gaussians, view, &mut adam, &mut density);
     }
     (gaussians, density)
