@@ -230,7 +230,9 @@ impl GpuDevice {
 
     /// Largest buffer that a kernel can see, bytes.
     pub(crate) fn max_buffer(&self) -> u64 {
-        self.limits.max_buffer_size.min(self.limits.max_storage_buffer_binding_size)
+        // Kernels count words in 32 bits.
+        let counted = 4 * u64::from(u32::MAX);
+        self.limits.max_buffer_size.min(self.limits.max_storage_buffer_binding_size).min(counted)
     }
 
     /// Whether the device still does what it is told.

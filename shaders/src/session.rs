@@ -173,14 +173,18 @@ impl GpuSession {
             let state: Vec<State> = read(&context.device, &self.buffers.common.state, 1)?;
             let State { failed, failed_step, needed, .. } = state[0];
             let done = if failed == 0 { self.submitted.len() } else { failed_step as usize };
-            self.losses.extend(read::<f32>(&context.device, &self.loss.losses, done)?);
+            let losses: Vec<f32> = read(&context.device, &self.loss.losses, done)?;
+            if failed != 0 {
+                // Before anything changes here: where there is no room, asking again must find what it found now.
+                let size = self.buffers.size.with_room(&context.device, needed)?;
+                admit(&context.device, &self.requests(&size, self.active.len()))?;
+                self.buffers.resize(&context.device, size)?;
+            }
+            self.losses.extend(losses);
             self.submitted.drain(..done);
             if failed == 0 {
                 break;
             }
-            let size = self.buffers.size.with_room(&context.device, needed)?;
-            admit(&context.device, &self.requests(&size, self.active.len()))?;
-            self.buffers.resize(&context.device, size)?;
             self.bind();
             for (place, step) in self.submitted.iter().enumerate() {
                 self.submit(step, place);

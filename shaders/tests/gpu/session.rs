@@ -5,6 +5,7 @@ use splat_shaders::GpuEngine;
 
 use crate::support::{arc, blobs, engine, open};
 use splat::{
+    cameras::Camera,
     engine::{Engine, EngineError, SessionInput, TrainingView},
     gaussians::Gaussians,
     image::{Image, Mask},
@@ -269,4 +270,36 @@ fn what_does_not_fit_is_refused_with_figures() {
     giants.log_scales.fill([3.0; 3]);
     let refused = limited.render(&giants, &arc(1, 512, 512)[0], BLACK).err();
     assert!(matches!(refused, Some(EngineError::OutOfResources { .. })), "{refused:?}");
+}
+
+#[test]
+fn a_session_that_runs_out_of_room_says_so_every_time() {
+    let Some(_) = engine() else { return };
+    let limited = GpuEngine::new(open().with_memory_limit(12_000_000)).unwrap();
+    let camera = arc(1, 320, 320).swap_remove(0);
+    let small = arc(1, 16, 16).swap_remove(0);
+    let view = |camera: Camera| TrainingView {
+        image: Arc::new(Image::filled(camera.width, camera.height, BLACK)),
+        camera,
+        mask: None,
+    };
+    // 400 tiles each in the large view, one in the small.
+    let mut giants = blobs(700, 0, 20);
+    giants.log_scales.fill([3.0; 3]);
+    let mut session = limited
+        .session(SessionInput {
+            gaussians: giants,
+            views: vec![view(small), view(camera)],
+            background: BLACK,
+            dssim_weight: 0.2,
+            frozen: Vec::new(),
+        })
+        .unwrap();
+    for step in [0, 0, 1, 0] {
+        session.step(step, &RATES).unwrap();
+    }
+    for _ in 0..3 {
+        let refused = session.take_losses().err();
+        assert!(matches!(refused, Some(EngineError::OutOfResources { .. })), "{refused:?}");
+    }
 }
