@@ -9,7 +9,7 @@
 use super::{
     blend::{BATCH, Open},
     blocks::{BLOCK, BLOCKS, BandView, Listed, TILE, TileLists, corner},
-    tile::{Offsets, Tile, first_offset},
+    tile::{Offsets, Tile},
 };
 use crate::{
     motion::reweighting::ExpectedMotion,
@@ -191,10 +191,8 @@ impl BlockTracks {
 
 /// An expected motion as a block's pixels need it.
 struct LocalMotion {
-    /// Expected displacement at the block's centre, relative to the reference.
+    /// Relative to the reference.
     displacement: [f32; 2],
-    /// Its change per column and row.
-    gradient: [[f32; 2]; 2],
     /// Exponent to base 2 per squared residual.
     fall: f32,
 }
@@ -202,29 +200,19 @@ struct LocalMotion {
 impl LocalMotion {
     #[inline(always)]
     fn new(motion: &ExpectedMotion, tracks: &BlockTracks) -> Self {
-        let [[xu, xv], [yu, yv]] = motion.gradient;
-        let (u, v) = (tracks.centre[0] - motion.centre[0], tracks.centre[1] - motion.centre[1]);
-        let x = motion.displacement[0] + xu * u + xv * v - tracks.reference[0];
-        let y = motion.displacement[1] + yu * u + yv * v - tracks.reference[1];
+        let [x, y] = motion.displacement;
         Self {
-            displacement: [x as f32, y as f32],
-            gradient: [[xu as f32, xv as f32], [yu as f32, yv as f32]],
+            displacement: [(x - tracks.reference[0]) as f32, (y - tracks.reference[1]) as f32],
             fall: (motion.inverse_scale_squared * std::f64::consts::LOG2_E) as f32,
         }
     }
 
     /// The share of each pixel's weight that its residual leaves.
     #[inline(always)]
-    fn share<S: Simd>(&self, tracks: &BlockTracks, block: usize, at: &Offsets<S>) -> S {
-        let middle = (BLOCK as f32 - 1.0) / 2.0;
-        let [first_x, first_y] = first_offset(block);
-        let (u, v) = (at.x.sub(S::splat(first_x + middle)), at.y.sub(S::splat(first_y + middle)));
+    fn share<S: Simd>(&self, tracks: &BlockTracks) -> S {
         let mut squared = S::splat(0.0);
         for axis in 0..2 {
-            let [by_u, by_v] = self.gradient[axis];
-            let expected = u.mul_add(S::splat(by_u), S::splat(self.displacement[axis]));
-            let expected = v.mul_add(S::splat(by_v), expected);
-            let residual = S::load(&tracks.displacement[axis]).sub(expected);
+            let residual = S::load(&tracks.displacement[axis]).sub(S::splat(self.displacement[axis]));
             squared = residual.mul_add(residual, squared);
         }
         // Below, the power may be anything.
@@ -398,7 +386,7 @@ impl Live {
                     continue;
                 }
                 if let Some(motion) = places.slots.expected.get(slot as usize) {
-                    weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks, block, &at));
+                    weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks));
                 }
                 weight.store(&mut self.weights[self.count].0);
                 self.slots[self.count] = slot;

@@ -67,8 +67,8 @@ impl Seen {
 
 /// Offsets of a block's pixels from the centre of its tile.
 pub(super) struct Offsets<S> {
-    pub x: S,
-    pub y: S,
+    x: S,
+    y: S,
 }
 
 impl<S: Simd> Offsets<S> {
