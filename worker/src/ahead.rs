@@ -29,18 +29,22 @@ struct Loading {
 }
 
 impl Ahead {
-    /// Begins to load a frame's inputs, in place of what was loaded before.
+    /// Begins to load a frame's inputs.
     pub(crate) fn begin(&self, job: FrameJob, blobs: Blobs, cache: Arc<InputCache>) {
-        let is_loading = |loading: &Loading| loading.job == job;
-        let mut slot = self.slot.lock().unwrap_or_else(PoisonError::into_inner);
-        if decoded_bytes(&job) > MAX_BYTES || slot.as_ref().is_some_and(is_loading) {
+        if decoded_bytes(&job) > MAX_BYTES {
             return;
         }
         let work = {
             let job = job.clone();
             async move { inputs::load(&job, &blobs, &cache).await }
         };
-        *slot = Some(Loading { job, task: AbortOnDropHandle::new(tokio::spawn(work)) });
+        let task = AbortOnDropHandle::new(tokio::spawn(work));
+        *self.slot.lock().unwrap_or_else(PoisonError::into_inner) = Some(Loading { job, task });
+    }
+
+    /// Gives the memory back: the guess was wrong, or nobody knows when it will be right.
+    pub(crate) fn forget(&self) {
+        self.slot.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
     /// The inputs of `job` if they were begun and can be had; nobody hears of a failure, as they will be loaded again.
@@ -57,8 +61,10 @@ fn decoded_bytes(job: &FrameJob) -> u64 {
     let pixels = |view: &FrameView| {
         view.camera.as_ref().map_or(0, |camera| u64::from(camera.width) * u64::from(camera.height))
     };
-    let all: u64 = job.training_views.iter().chain(&job.test_views).map(pixels).sum();
-    all.saturating_mul(BYTES_PER_PIXEL)
+    let views = job.training_views.iter().chain(&job.test_views).map(pixels).fold(0, u64::saturating_add);
+    // Usually shared with the frame at hand; a large one may not stay in the cache.
+    let static_model = job.static_model.as_ref().map_or(0, |blob| blob.size);
+    views.saturating_mul(BYTES_PER_PIXEL).saturating_add(static_model)
 }
 
 #[cfg(test)]
@@ -89,6 +95,7 @@ mod tests {
 
         ahead.begin(job, blobs, cache);
         assert!(ahead.take(&coordinator.frame_job(3)).await.is_none(), "the guess was wrong");
+        assert!(ahead.slot.lock().unwrap().is_none());
     }
 
     #[tokio::test]
@@ -105,8 +112,9 @@ mod tests {
     async fn a_frame_beyond_the_bound_waits_for_its_turn() {
         let (coordinator, blobs, cache) = bench().await;
         let mut job = coordinator.frame_job(2);
-        job.training_views[0].camera = Some(wire_camera(32_768, 32_768));
-        assert!(decoded_bytes(&job) > MAX_BYTES);
+        for view in &mut job.training_views {
+            view.camera = Some(wire_camera(u32::MAX, u32::MAX));
+        }
         let ahead = Ahead::default();
         ahead.begin(job, blobs, cache);
         assert!(ahead.slot.lock().unwrap().is_none());

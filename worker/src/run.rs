@@ -299,7 +299,12 @@ impl Worker {
                     }
                     resend.reset();
                 }
-                _ = heartbeat.tick() => connection.send(self.heartbeat())?,
+                _ = heartbeat.tick() => {
+                    if self.running.is_none() && self.unacknowledged.is_none() {
+                        self.runner.ahead.forget();
+                    }
+                    connection.send(self.heartbeat())?;
+                }
                 _ = resend.tick(), if self.unacknowledged.is_some() => self.send_report(&connection)?,
             }
         }

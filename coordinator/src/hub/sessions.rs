@@ -195,8 +195,12 @@ impl Hub {
         change.commit().await?;
         self.tell_stored(&key.job);
         let job = Some(self.frame_job(key).await?);
-        let likely_next = match desk.queue.likely_next(worker_id) {
-            Some(next) => Some(self.frame_job(next).await?),
+        let likely_next = match desk.queue.likely_next(&lease) {
+            Some(next) => self
+                .frame_job(next)
+                .await
+                .inspect_err(|error| tracing::warn!(%error, frame = next.frame, "no hint at the next frame"))
+                .ok(),
             None => None,
         };
         tracing::info!(job_id = %key.job, frame = key.frame, attempt, worker_id, lease_id = id, "frame leased");

@@ -272,11 +272,13 @@ impl Queue {
         Some(lease)
     }
 
-    /// What a worker that was just given a lease will likely be given next: those with older leases ask before it does.
-    pub fn likely_next(&self, worker_id: &str) -> Option<&FrameKey> {
+    /// What the holder of a lease that was just given will likely be given next: those with older leases ask before it
+    /// does. Of leases given at the same time those of earlier frames count as older.
+    pub fn likely_next(&self, lease: &Lease) -> Option<&FrameKey> {
+        let age = |lease: &Lease| (lease.since, lease.key.clone());
+        let older = self.leases.values().filter(|other| age(other) < age(lease)).count();
         let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());
-        let others = self.leases.values().filter(|lease| lease.worker_id != worker_id).count();
-        ready.filter(|(_, frame)| self.may_take(frame, worker_id)).nth(others).map(|(key, _)| key)
+        ready.filter(|(_, frame)| self.may_take(frame, &lease.worker_id)).nth(older).map(|(key, _)| key)
     }
 
     /// Whether a worker may take a frame: never if it lacks the resources; if it was lost with the frame before, only

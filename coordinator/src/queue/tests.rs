@@ -70,16 +70,29 @@ fn key(frame: u32) -> FrameKey {
 #[test]
 fn those_who_began_earlier_will_ask_earlier() {
     let mut bench = Bench::new(1..=5);
-    let next = |bench: &Bench, worker| bench.queue.likely_next(worker).map(|key| key.frame);
+    let next = |bench: &Bench, lease: &Lease| bench.queue.likely_next(lease).map(|key| key.frame);
     bench.connect(1, "one");
-    bench.assign_one();
-    assert_eq!(next(&bench, "one"), Some(2), "nobody else works");
+    let lease = bench.assign_one();
+    assert_eq!(next(&bench, &lease), Some(2), "nobody else works");
+    bench.now += Duration::from_secs(1);
     bench.connect(2, "two");
-    bench.assign_one();
-    assert_eq!(next(&bench, "two"), Some(4), "worker one takes frame 3 before");
+    let lease = bench.assign_one();
+    assert_eq!(next(&bench, &lease), Some(4), "worker one takes frame 3 before");
+    bench.now += Duration::from_secs(1);
     bench.connect(3, "three");
-    bench.assign_one();
-    assert_eq!(next(&bench, "three"), None, "the others take what is left");
+    let lease = bench.assign_one();
+    assert_eq!(next(&bench, &lease), None, "the others take what is left");
+}
+
+#[test]
+fn workers_that_begin_together_expect_different_frames() {
+    let mut bench = Bench::new(1..=5);
+    for (session, worker) in [(1, "one"), (2, "two"), (3, "three")] {
+        bench.connect(session, worker);
+    }
+    let leases = bench.assign();
+    let next = leases.iter().map(|lease| bench.queue.likely_next(lease).map(|key| key.frame));
+    assert_eq!(next.collect::<Vec<_>>(), [Some(4), Some(5), None]);
 }
 
 #[test]

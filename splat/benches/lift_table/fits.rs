@@ -77,14 +77,17 @@ impl NoisyFits {
         Ok(Self { views, index_of })
     }
 
-    /// Fields to hand over with the cameras: they claim the right noise; their positions only say that nothing rests.
+    /// Fields to hand over with the cameras: they claim the right noise; their positions only say that nothing rests and that nothing leaves the image.
     pub(crate) fn tracks(&self) -> impl Iterator<Item = TrackField> + '_ {
         self.views.iter().map(|FittedView { camera, sigma, .. }| {
-            let pixels = camera.width as usize * camera.height as usize;
+            let (width, height) = (camera.width, camera.height);
+            let pixels = width as usize * height as usize;
+            let elsewhere =
+                |y: u32| (0..width).map(move |x| [((x + width / 2) % width) as f32 + 0.5, y as f32 + 0.5]);
             TrackField {
-                width: camera.width,
-                height: camera.height,
-                positions: vec![[-1e3; 2]; pixels],
+                width,
+                height,
+                positions: (0..height).flat_map(elsewhere).collect(),
                 visible: vec![true; pixels],
                 sigma: vec![*sigma; pixels],
             }

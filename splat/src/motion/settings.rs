@@ -132,7 +132,7 @@ impl MotionSettings {
             static_share: 0.5,
             outlier_significance: 4.0,
             outlier_floor: 1.0,
-            max_relative_deviation: 0.005,
+            max_relative_deviation: 0.02,
             expected_rotation: 1.0,
             rotation_significance: 3.0,
             scale_significance: 4.0,

@@ -38,7 +38,7 @@ pub(super) struct RoundLimit {
     pub places: usize,
 }
 
-/// More than any but huge scenes need: most bands take one round. Four and one MiB of memory per band at most.
+/// More than any but huge scenes need: most bands take one round. Seven MiB of memory per band at most.
 impl Default for RoundLimit {
     fn default() -> Self {
         Self { footprints: 1 << 16, places: 1 << 18 }

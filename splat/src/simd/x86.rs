@@ -19,7 +19,7 @@ pub(crate) struct Avx2(__m256, __m256);
 macro_rules! intrinsic {
     ($call:expr) => {
         // SAFETY: by the contract of `Simd` this runs on a machine with the instruction set; memory operands are
-        // unaligned accesses to whole arrays of floats.
+        // unaligned accesses to whole arrays of numbers.
         unsafe { $call }
     };
 }
