@@ -11,7 +11,7 @@ use crate::{
     cameras::Camera,
     gaussians::Gaussians,
     image::{Image, Mask},
-    motion::moments::FootprintMoments,
+    motion::{moments::FootprintMoments, reweighting::Reweighting},
     optim::LearningRates,
     tracking::TrackField,
 };
@@ -119,12 +119,18 @@ pub trait Engine: Send + Sync {
     ) -> Result<Rendering, EngineError>;
 
     /// Weighted moments of every Gaussian's footprint under a track field of the camera's size, one entry per
-    /// Gaussian, in one rasterization pass.
+    /// Gaussian.
+    ///
+    /// One rasterization pass without `reweighting`. With it, up to [`Reweighting::passes`] more: before each,
+    /// [`Reweighting::expected`] says for which footprints and by which motion; their moments are then summed
+    /// again with every pixel's weight times the share that its residual leaves, and go through
+    /// [`FootprintMoments::reweigh`].
     fn footprint_moments(
         &self,
         gaussians: &Gaussians,
         camera: &Camera,
         tracks: &TrackField,
+        reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError>;
 
     /// Opens an optimisation session.

@@ -89,7 +89,7 @@ fn blending_weights_of_a_footprint_match() {
             visible: vec![true; pixels],
             sigma: vec![1.0; pixels],
         };
-        let moments = engine.footprint_moments(&golden.gaussians(), &camera, &tracks).unwrap();
+        let moments = engine.footprint_moments(&golden.gaussians(), &camera, &tracks, None).unwrap();
         let error = relative_norm(moments.iter().map(|m| m.blend_weight), golden.values("weight_sum"));
         assert!(error < 1e-5, "{name}: weights off by {error:e}");
     });
@@ -111,7 +111,8 @@ fn footprint_moments_match_on_every_track_field() {
             visible: vec![true; camera.width as usize * camera.height as usize],
             sigma: vec![1.0; camera.width as usize * camera.height as usize],
         };
-        let moments = CpuEngine::default().footprint_moments(&golden.gaussians(), &camera, &tracks).unwrap();
+        let moments =
+            CpuEngine::default().footprint_moments(&golden.gaussians(), &camera, &tracks, None).unwrap();
         let golden_pixels = golden.values("pixel_count");
         for (index, found) in moments.iter().enumerate() {
             assert_eq!(f64::from(found.pixels), golden_pixels[index], "{field}: pixels of Gaussian {index}");

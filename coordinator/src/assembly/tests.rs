@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use splat::{
     engine::{EngineError, Rendering, Session, SessionInput},
     frame::ViewMetrics,
-    motion::moments::FootprintMoments,
+    motion::{moments::FootprintMoments, reweighting::Reweighting},
     tracking::TrackField,
 };
 
@@ -31,6 +31,7 @@ impl Engine for FlatEngine {
         _: &Gaussians,
         _: &Camera,
         _: &TrackField,
+        _: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         Err(EngineError::InvalidInput("not needed here".into()))
     }

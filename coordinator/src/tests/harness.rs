@@ -9,7 +9,7 @@ use splat::{
     frame::FrameReport,
     gaussians::{Gaussians, delta},
     image::Image,
-    motion::moments::FootprintMoments,
+    motion::{moments::FootprintMoments, reweighting::Reweighting},
     tracking::TrackField,
 };
 use tokio::sync::mpsc;
@@ -55,6 +55,7 @@ impl Engine for BackgroundEngine {
         gaussians: &Gaussians,
         _camera: &Camera,
         _tracks: &TrackField,
+        _reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         Ok(vec![FootprintMoments::default(); gaussians.len()])
     }

@@ -15,7 +15,7 @@ use crate::{
     gaussians::{Gaussians, validate::validate},
     image::{Image, Mask},
     metrics,
-    motion::{self, MotionOrigin, MotionView},
+    motion::{self, MotionOrigin, MotionView, OrderCounts},
     refine::{self, RefineInput},
     settings::{MaskUse, MotionSource, Settings},
     tracking::TrackField,
@@ -97,6 +97,9 @@ pub struct FrameReport {
     pub after: Vec<ViewMetrics>,
     /// Where the motions came from, as motion compensation found them; if `rolled_back`, none was applied.
     pub motion: MotionCounts,
+    /// Which 2D models the footprints got, over all Gaussians and the training views that see them.
+    #[serde(default)]
+    pub orders: OrderCounts,
     /// Whether motion compensation rendered worse than no motion on the training views and was undone.
     pub rolled_back: bool,
     /// Gaussians whose refinement left the range of numbers; they are as motion compensation left them.
@@ -146,8 +149,12 @@ pub fn reconstruct_frame(
     };
     advance("motion", 0, 1)?;
     let start = compensate(engine, input)?;
-    let mut report =
-        FrameReport { motion: start.counts, rolled_back: start.rolled_back, ..FrameReport::default() };
+    let mut report = FrameReport {
+        motion: start.counts,
+        orders: start.orders,
+        rolled_back: start.rolled_back,
+        ..FrameReport::default()
+    };
     advance("evaluate", 0, 1)?;
     report.before = evaluate(engine, &start.gaussians, input)?;
     if input.is_key_frame {
@@ -208,6 +215,7 @@ struct Start {
     gaussians: Gaussians,
     frozen: Vec<bool>,
     counts: MotionCounts,
+    orders: OrderCounts,
     rolled_back: bool,
 }
 
@@ -216,7 +224,10 @@ fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameErr
         .training_views
         .iter()
         .filter_map(|view| {
-            view.tracks.clone().map(|tracks| MotionView { camera: view.camera.clone(), tracks })
+            let tracks = view.tracks.clone()?;
+            let mask = view.mask.as_ref().filter(|_| input.settings.masks == MaskUse::Train);
+            let tracks = mask.map_or(tracks.clone(), |mask| Arc::new(motion::within_mask(&tracks, mask)));
+            Some(MotionView { camera: view.camera.clone(), tracks })
         })
         .collect();
     if input.is_key_frame || views.is_empty() || input.settings.motion_source == MotionSource::None {
@@ -224,6 +235,7 @@ fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameErr
             gaussians: input.static_model.as_ref().clone(),
             frozen: Vec::new(),
             counts: MotionCounts::default(),
+            orders: OrderCounts::default(),
             rolled_back: false,
         });
     }
@@ -241,7 +253,7 @@ fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameErr
         input.settings.background,
         &input.settings.refine,
     )?;
-    Ok(Start { gaussians, frozen, counts, rolled_back })
+    Ok(Start { gaussians, frozen, counts, orders: field.orders, rolled_back })
 }
 
 /// Puts Gaussians with a parameter that is no finite number back to where they started; returns how many.

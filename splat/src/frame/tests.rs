@@ -83,6 +83,7 @@ fn tracks_move_the_model_before_refinement() {
     assert!(!result.report.rolled_back);
     let solved = result.report.motion.solved;
     assert!(solved > 30, "{:?}", result.report.motion);
+    assert!(result.report.orders.translation > 60, "{:?}", result.report.orders);
     let mut still = input.clone();
     still.settings.motion_source = MotionSource::None;
     let without = reconstruct_frame(&CpuEngine::default(), &still, &mut go_on).unwrap();
@@ -105,6 +106,9 @@ fn resting_tracks_leave_every_gaussian_static() {
     let result = reconstruct_frame(&CpuEngine::default(), &input, &mut go_on).unwrap();
     let counts = result.report.motion;
     assert_eq!((counts.solved, counts.propagated), (0, 0), "{counts:?}");
+    let orders = result.report.orders;
+    assert!(orders.r#static > 100, "{orders:?}");
+    assert_eq!((orders.translation, orders.similarity, orders.affine), (0, 0, 0), "{orders:?}");
 }
 
 #[test]
@@ -144,6 +148,25 @@ fn what_does_not_fit_is_bad_input() {
     assert!(refused(&|input| {
         Arc::make_mut(&mut input.static_model).means[3][0] = f32::NAN;
     }));
+}
+
+#[test]
+fn tracks_out_of_a_training_mask_move_nothing() {
+    let mut input = input(&lowered(), [0.0, 2.0]);
+    input.settings.masks = MaskUse::Train;
+    let counted = |input: &FrameInput| {
+        reconstruct_frame(&CpuEngine::default(), input, &mut go_on).unwrap().report.orders
+    };
+    let seen = counted(&input);
+    for view in &mut input.training_views {
+        // The right half.
+        let inside = (0..4800).map(|pixel| pixel % 80 >= 40).collect();
+        view.mask = Some(Arc::new(Mask { width: 80, height: 60, inside }));
+    }
+    let half = counted(&input);
+    assert!(half.translation * 4 < seen.translation * 3, "{half:?} of {seen:?}");
+    input.settings.masks = MaskUse::Evaluate;
+    assert_eq!(counted(&input), seen, "masks that only mark what is reported do not matter");
 }
 
 #[test]

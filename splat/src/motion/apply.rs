@@ -6,15 +6,23 @@ use rayon::prelude::*;
 use super::MotionField;
 use crate::gaussians::{Gaussians, sh};
 
-/// The Gaussians after a motion: means moved, rotations composed, spherical harmonics rotated with them.
+/// The Gaussians after a motion: means moved, rotations composed, spherical harmonics rotated with them, scales
+/// stretched.
 ///
-/// Scales and opacities stay, and so does the norm of each stored quaternion. A Gaussian without motion keeps
+/// Opacities stay, and so does the norm of each stored quaternion. A Gaussian without motion keeps
 /// its bytes.
 pub fn apply(gaussians: &Gaussians, field: &MotionField) -> Gaussians {
     let mut moved = gaussians.clone();
     for (index, translation) in field.translation.iter().enumerate().take(moved.len()) {
         if *translation != glam::DVec3::ZERO {
             moved.means[index] = (gaussians.mean(index) + *translation).as_vec3().to_array();
+        }
+    }
+    for (stored, change) in moved.log_scales.iter_mut().zip(&field.log_scale) {
+        if *change != glam::DVec3::ZERO {
+            for (stored, change) in stored.iter_mut().zip(change.to_array()) {
+                *stored += change as f32;
+            }
         }
     }
     moved.rotations.par_iter_mut().zip(&field.rotation).for_each(|(stored, turn)| {

@@ -2,11 +2,13 @@
 //!
 //! | step | file |
 //! |---|---|
-//! | affine motion of each footprint, with its uncertainty | `fit2d` |
+//! | sums over a footprint's pixels, robust to other surfaces | `moments`, `reweighting` |
+//! | motion of each footprint, with its order and uncertainty | `fit2d`, `order` |
 //! | which views see a Gaussian, and how well | `observe` |
 //! | Gaussians at rest | `static_test` |
 //! | new positions, robust to wrong views | `lift` |
 //! | rotations from neighbours and from the footprints' deformation | `rotation` |
+//! | changes of scale, where beyond doubt | `strain` |
 //! | motion of unobserved Gaussians from agreeing neighbours | `propagate` |
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
@@ -22,11 +24,14 @@ mod linear;
 pub mod moments;
 mod neighbours;
 mod observe;
+mod order;
 mod propagate;
 mod regularize;
+pub mod reweighting;
 mod rotation;
 mod settings;
 mod static_test;
+mod strain;
 #[cfg(test)]
 mod tests;
 mod value_order;
@@ -36,6 +41,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use apply::apply;
+pub use observe::within_mask;
+pub use order::OrderCounts;
 pub use settings::MotionSettings;
 
 use crate::{
@@ -74,6 +81,10 @@ pub struct MotionField {
     pub origin: Vec<MotionOrigin>,
     /// Information matrix of each translation, 1 / world unit²: zero where nothing was observed.
     pub information: Vec<glam::DMat3>,
+    /// Change of the logarithm of each Gaussian's scales, along its own axes; zero unless significant.
+    pub log_scale: Vec<glam::DVec3>,
+    /// Which models the footprints got.
+    pub orders: OrderCounts,
 }
 
 /// One view's camera and its tracks from the key frame to the target frame.
@@ -121,7 +132,7 @@ fn estimate_in_order(
     turn_solved(&mut states, &observations, views, &context);
     propagate::propagate(&mut states, &context);
     regularize::regularize(&mut states, &context);
-    Ok(field(gaussians, &states, &observations, views))
+    Ok(field(&states, &observations, views, &context))
 }
 
 /// What a Gaussian's own footprints say about its translation.
@@ -186,15 +197,15 @@ fn turn_solved(
 }
 
 fn field(
-    gaussians: &Gaussians,
     states: &[State],
     observations: &[Vec<Observation>],
     views: &[MotionView],
+    context: &Context<'_>,
 ) -> MotionField {
     let information = |index: usize| match &states[index].own {
         Some(own) => own.information,
         None if states[index].origin == MotionOrigin::Static => {
-            resting_information(gaussians.mean(index), &observations[index], views)
+            resting_information(context.gaussians.mean(index), &observations[index], views)
         }
         None => DMat3::ZERO,
     };
@@ -203,6 +214,8 @@ fn field(
         rotation: states.iter().map(|state| state.rotation).collect(),
         origin: states.iter().map(|state| state.origin).collect(),
         information: (0..states.len()).into_par_iter().map(information).collect(),
+        log_scale: strain::log_strains(states, observations, views, context),
+        orders: OrderCounts::of(observations.iter().flatten().map(|observation| observation.fit.order)),
     }
 }
 

@@ -1,5 +1,7 @@
 //! What each view says about each Gaussian.
 
+use std::borrow::Cow;
+
 use glam::{DMat2, DVec2};
 use rayon::prelude::*;
 
@@ -7,12 +9,15 @@ use super::{
     MotionSettings, MotionView,
     fit2d::{self, Fit},
     moments::FootprintMoments,
+    reweighting::Reweighting,
 };
 use crate::{
     cameras::Camera,
     engine::{Engine, EngineError},
     gaussians::Gaussians,
+    image::Mask,
     raster::LOW_PASS,
+    tracking::TrackField,
 };
 
 /// One view's fit of one Gaussian.
@@ -32,7 +37,13 @@ pub(super) fn observe(
     views: &[MotionView],
     settings: &MotionSettings,
 ) -> Result<Vec<Vec<Observation>>, EngineError> {
-    let mut observations = vec![Vec::new(); gaussians.len()];
+    let mut observations: Vec<Vec<Observation>> =
+        (0..gaussians.len()).map(|_| Vec::with_capacity(views.len())).collect();
+    let reweighting = Reweighting {
+        passes: settings.reweighting_passes,
+        noise_correlation_area: settings.noise_correlation_area,
+        noise_floor: settings.noise_floor,
+    };
     for (view, MotionView { camera, tracks }) in views.iter().enumerate() {
         if (tracks.width, tracks.height) != (camera.width, camera.height) {
             return Err(EngineError::InvalidInput(format!(
@@ -40,7 +51,8 @@ pub(super) fn observe(
                 tracks.width, tracks.height, camera.width, camera.height
             )));
         }
-        let moments = engine.footprint_moments(gaussians, camera, tracks)?;
+        let tracks = within_image(camera, tracks);
+        let moments = engine.footprint_moments(gaussians, camera, &tracks, Some(&reweighting))?;
         if moments.len() != gaussians.len() {
             return Err(EngineError::InvalidInput(format!(
                 "engine {} gave {} footprints for {} Gaussians",
@@ -58,6 +70,38 @@ pub(super) fn observe(
     }
     observations.par_iter_mut().for_each(|list| trust_unoccluded(list, settings));
     Ok(observations)
+}
+
+/// The tracks without those that claim to see a point outside of the image.
+fn within_image<'a>(camera: &Camera, tracks: &'a TrackField) -> Cow<'a, TrackField> {
+    let is_inside = |position: &[f32; 2]| camera.contains(DVec2::from_array(position.map(f64::from)));
+    let leave: Vec<usize> = (0..tracks.visible.len())
+        .filter(|&p| tracks.visible[p] && !is_inside(&tracks.positions[p]))
+        .collect();
+    if leave.is_empty() {
+        return Cow::Borrowed(tracks);
+    }
+    let mut tracks = tracks.clone();
+    for pixel in leave {
+        tracks.visible[pixel] = false;
+    }
+    Cow::Owned(tracks)
+}
+
+/// The tracks without those that end outside of a mask of the target frame: what a mask leaves out of training is no
+/// place to move to. Tracks of another size than the mask stay as they are.
+pub fn within_mask(tracks: &TrackField, mask: &Mask) -> TrackField {
+    let mut tracks = tracks.clone();
+    if (mask.width, mask.height) != (tracks.width, tracks.height) {
+        return tracks;
+    }
+    let (width, height) = (f64::from(mask.width), f64::from(mask.height));
+    for (visible, position) in tracks.visible.iter_mut().zip(&tracks.positions) {
+        let [x, y] = position.map(f64::from);
+        let is_in_image = x >= 0.0 && y >= 0.0 && x < width && y < height;
+        *visible &= is_in_image && mask.inside[y as usize * mask.width as usize + x as usize];
+    }
+    tracks
 }
 
 fn observation(

@@ -29,6 +29,9 @@ pub struct MotionSettings {
     /// Least number of views that a position is solved from; default 2, as in the paper. A single view still
     /// counts along the directions it sees once neighbours give the depth.
     pub min_views: usize,
+    /// Passes over the pixels that fit footprints of two surfaces again with robust weights; default 3, `draft`
+    /// 1. Zero trusts every visible track alike.
+    pub reweighting_passes: u32,
     /// Expected change of a footprint's shape, standard deviation of `A - I`; default 0.3. Ties the affine
     /// fit of small or noisy footprints to a translation.
     pub expected_strain: f64,
@@ -41,7 +44,8 @@ pub struct MotionSettings {
     /// public code.
     pub static_floor: f64,
     /// Displacement over the standard deviation that the tracks claim below which a footprint does not move;
-    /// default 3, which 1 % of resting footprints exceed; most views of a Gaussian must for it to count as moving.
+    /// default 3, which 1 % of resting footprints exceed; most views of a Gaussian must for it to count as moving. A
+    /// strain of the same significance is motion too.
     pub static_significance: f64,
     /// Share of the observing views, weighted by how well they see it, that must find a Gaussian at rest;
     /// default 0.5.
@@ -59,6 +63,11 @@ pub struct MotionSettings {
     /// Rotation over its standard deviation below which a Gaussian does not turn; larger rotations shrink by
     /// the same share of their square. Default 3 (3 % of unturned Gaussians exceed it in three dimensions).
     pub rotation_significance: f64,
+    /// Stretch of an axis over its standard deviation below which a Gaussian keeps its scale; default 4: a wrong
+    /// scale costs more than a missing one.
+    pub scale_significance: f64,
+    /// Largest change of the logarithm of a scale; default 0.2.
+    pub max_log_strain: f64,
     /// Nearest neighbours per Gaussian; default 12, `draft` 8 (the paper's).
     pub neighbours: usize,
     /// Longest edge between neighbours, in medians of the distance to the farthest of the nearest neighbours;
@@ -99,6 +108,7 @@ impl MotionSettings {
             min_visible_share: 0.6,
             min_relative_transmittance: 0.1,
             min_views: 2,
+            reweighting_passes: if is_draft { 1 } else { 3 },
             expected_strain: 0.3,
             noise_correlation_area: 16.0,
             noise_floor: 0.05,
@@ -110,6 +120,8 @@ impl MotionSettings {
             max_relative_deviation: 0.005,
             expected_rotation: 1.0,
             rotation_significance: 3.0,
+            scale_significance: 4.0,
+            max_log_strain: 0.2,
             neighbours: if is_draft { 8 } else { 12 },
             max_edge: 8.0,
             neighbour_strain: 0.1,

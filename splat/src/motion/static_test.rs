@@ -1,20 +1,18 @@
 //! Whether a Gaussian moves at all.
 
-use super::{MotionSettings, observe::Observation};
+use super::{MotionSettings, observe::Observation, order::Order};
 
 /// Whether most of the views that see a Gaussian find it at rest.
 ///
-/// A footprint is at rest in a view if its displacement is insignificant against the noise that the tracks
-/// claim, or below an absolute floor. Noise that only the residual reveals is no excuse: a footprint of two
-/// motions moves. A view votes by the share of the Gaussian that it sees and by the sharpness of what it
-/// sees.
+/// A view finds it at rest if the order of its footprint's motion is [`Order::Static`]: displacement and strain are
+/// insignificant against the noise that the tracks claim, or below an absolute floor. Noise that only the residual
+/// reveals is no excuse: a footprint of two motions moves. A view votes by the share of the Gaussian that it sees and by
+/// the sharpness of what it sees.
 pub(super) fn is_at_rest(observations: &[Observation], settings: &MotionSettings) -> bool {
     let (mut at_rest, mut all) = (0.0, 0.0);
     for Observation { fit, transmittance, .. } in observations {
         let sharpness = 1.0 / (fit.claimed_variance + settings.static_floor.powi(2)).max(f64::MIN_POSITIVE);
-        let squared = fit.displacement.length_squared();
-        let insignificant = squared <= settings.static_significance.powi(2) * fit.claimed_variance;
-        if insignificant || squared <= settings.static_floor.powi(2) {
+        if fit.order == Order::Static {
             at_rest += sharpness * transmittance;
         }
         all += sharpness * transmittance;

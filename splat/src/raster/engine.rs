@@ -10,7 +10,7 @@ use crate::{
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
-    motion::moments::FootprintMoments,
+    motion::{moments::FootprintMoments, reweighting::Reweighting},
     simd::Instructions,
     tracking::TrackField,
 };
@@ -72,9 +72,10 @@ impl Engine for CpuEngine {
         gaussians: &Gaussians,
         camera: &Camera,
         tracks: &TrackField,
+        reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         check_size(camera)?;
-        footprint_moments::footprint_moments(self.instructions, gaussians, camera, tracks)
+        footprint_moments::footprint_moments(self.instructions, gaussians, camera, tracks, reweighting)
     }
 
     fn session(&self, input: SessionInput) -> Result<Box<dyn Session>, EngineError> {

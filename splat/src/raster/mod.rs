@@ -1,7 +1,7 @@
 //! The CPU engine: differentiable rasterization of 3D Gaussians in blocks of 4 × 4 pixels.
 //!
 //! One file per stage, each named as the stage: [`project`] → [`bin`] → [`blend`] → [`blend_backward`] →
-//! [`project_backward`], strung together by [`Pass`]; [`footprint_moments`] shares the first two. The equations are those of 3D Gaussian
+//! [`project_backward`], strung together by [`Pass`]; [`footprint_moments`] and [`block_moments`] share the first two. The equations are those of 3D Gaussian
 //! Splatting (Kerbl et al. 2023, section 4 and 6) over EWA splatting (Zwicker et al. 2001).
 //!
 //! An image is cut into bands of [`bin::BAND_ROWS`] rows whatever the number of threads; every sum over bands is
@@ -10,6 +10,7 @@
 mod bin;
 mod blend;
 mod blend_backward;
+mod block_moments;
 mod blocks;
 mod colour;
 mod counts;

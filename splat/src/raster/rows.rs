@@ -2,19 +2,13 @@
 
 use super::project::Footprint;
 
-/// One footprint on one row: alpha at column `x` is `2^(peak - curvature · (x + 0.5 - centre)²)`.
+/// One footprint on one row.
 #[derive(Clone, Copy)]
 pub(super) struct Span {
     /// First column.
     pub first: usize,
     /// One past the last column.
     pub end: usize,
-    /// Offset of the first column's centre from the row centre, pixels.
-    pub offset: f32,
-    /// Logarithm to base 2 of alpha at the row centre.
-    pub peak: f32,
-    /// Half the inverse variance along the row, in units of base-2 exponents.
-    pub curvature: f32,
 }
 
 /// The columns of image row `row` on which the footprint's alpha can reach [`super::ALPHA_MIN`].
@@ -34,13 +28,7 @@ pub(super) fn span(footprint: &Footprint, row: usize, width: usize) -> Option<Sp
     if !(low <= high) {
         return None;
     }
-    Some(Span {
-        first: low as usize,
-        end: high as usize + 1,
-        offset: (low + 0.5 - centre) as f32,
-        peak: ((footprint.log_opacity - fall) * std::f64::consts::LOG2_E) as f32,
-        curvature: (0.5 * footprint.inverse_conditional * std::f64::consts::LOG2_E) as f32,
-    })
+    Some(Span { first: low as usize, end: high as usize + 1 })
 }
 
 /// The image rows of the band that the footprint can reach.

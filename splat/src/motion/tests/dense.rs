@@ -7,7 +7,10 @@ use crate::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::Gaussians,
-    motion::moments::FootprintMoments,
+    motion::{
+        moments::FootprintMoments,
+        reweighting::{ExpectedMotion, Reweighting},
+    },
     tracking::TrackField,
 };
 
@@ -28,8 +31,13 @@ impl Engine for DenseEngine {
         gaussians: &Gaussians,
         camera: &Camera,
         tracks: &TrackField,
+        reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
-        Ok(weights(gaussians, camera).iter().map(|w| moments(w, tracks)).collect())
+        let robust = |blend: &Blend| match reweighting {
+            Some(reweighting) => robust_moments(blend, tracks, reweighting),
+            None => moments(blend, tracks),
+        };
+        Ok(weights(gaussians, camera).iter().map(robust).collect())
     }
 
     fn session(&self, _: SessionInput) -> Result<Box<dyn Session>, EngineError> {
@@ -101,24 +109,55 @@ pub(super) fn weights(gaussians: &Gaussians, camera: &Camera) -> Vec<Blend> {
     weights
 }
 
+/// Centred moments of one footprint, fitted again as `reweighting` asks.
+fn robust_moments(blend: &Blend, tracks: &TrackField, reweighting: &Reweighting) -> FootprintMoments {
+    let mut found = moments(blend, tracks);
+    for _ in 0..reweighting.passes {
+        let Some(expected) = reweighting.expected(&found) else { break };
+        found.reweigh(weighted_moments(blend, tracks, |source, target| share(&expected, source, target)));
+    }
+    found
+}
+
+/// What a pixel keeps of its weight.
+fn share(expected: &ExpectedMotion, source: DVec2, target: DVec2) -> f64 {
+    let offset = source - DVec2::from_array(expected.centre);
+    let gradient = expected.gradient.map(|row| DVec2::from_array(row).dot(offset));
+    let residual = target - source - DVec2::from_array(expected.displacement) - DVec2::from_array(gradient);
+    (-residual.length_squared() * expected.inverse_scale_squared).exp()
+}
+
 /// Centred moments of one footprint in two passes.
 pub(super) fn moments(blend: &Blend, tracks: &TrackField) -> FootprintMoments {
+    weighted_moments(blend, tracks, |_, _| 1.0)
+}
+
+/// The same with a share of each pixel's weight that depends on the pixel and its tracked position.
+fn weighted_moments(
+    blend: &Blend,
+    tracks: &TrackField,
+    share: impl Fn(DVec2, DVec2) -> f64,
+) -> FootprintMoments {
     let mut m = FootprintMoments { blend_weight: blend.iter().map(|(_, w)| w).sum(), ..Default::default() };
     let width = tracks.width as usize;
+    let usable =
+        |pixel: usize| tracks.visible[pixel] && tracks.positions[pixel].iter().all(|c| c.is_finite());
     let visible: Vec<(f64, f64, DVec2, DVec2)> = blend
         .iter()
-        .filter(|(pixel, _)| tracks.visible[*pixel])
+        .filter(|(pixel, _)| usable(*pixel))
         .map(|&(pixel, weight)| {
             let variance = f64::from(tracks.sigma[pixel]).powi(2);
             let source = DVec2::new((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
             let [x, y] = tracks.positions[pixel];
-            (weight / variance, variance, source, DVec2::new(x.into(), y.into()))
+            let target = DVec2::new(x.into(), y.into());
+            (weight / variance * share(source, target), variance, source, target)
         })
         .collect();
     if visible.is_empty() {
         return m;
     }
     m.pixels = visible.len() as u32;
+    m.visible = blend.iter().filter(|(pixel, _)| usable(*pixel)).map(|(_, w)| w).sum();
     let (mut source, mut target) = (DVec2::ZERO, DVec2::ZERO);
     for (w, variance, s, t) in &visible {
         m.weight += w;

@@ -10,6 +10,8 @@ fn assert_finite(field: &MotionField, count: usize) {
     assert!(field.translation.iter().all(|d| d.is_finite()));
     assert!(field.rotation.iter().all(|q| q.is_finite() && q.is_normalized()));
     assert!(field.information.iter().all(|h| h.is_finite()));
+    assert_eq!(field.log_scale.len(), count);
+    assert!(field.log_scale.iter().all(|s| s.abs().max_element() <= settings().max_log_strain));
 }
 
 #[test]

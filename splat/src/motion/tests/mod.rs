@@ -4,6 +4,8 @@
 mod clip;
 mod dense;
 mod extremes;
+mod moments;
+mod orders;
 mod parts;
 mod scenes;
 
@@ -218,6 +220,8 @@ fn moved_gaussians_look_the_same_from_the_moved_camera() {
         rotation: vec![truth.turn; 90],
         origin: vec![MotionOrigin::Solved; 90],
         information: vec![glam::DMat3::ZERO; 90],
+        log_scale: vec![DVec3::ZERO; 90],
+        orders: OrderCounts::default(),
     };
     let moved = apply(&gaussians, &field);
     let camera = &cameras(1)[0];

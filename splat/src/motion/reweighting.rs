@@ -1,0 +1,80 @@
+//! Robust weights of a footprint's pixels, from the moments of the pass before.
+//!
+//! A footprint that straddles two surfaces has tracks of both, and its first fit lies between them. Each further pass
+//! weighs a pixel by `exp(-|e|² / s²)` (Welsch's redescending weight), where `e` is its departure from the footprint's mean
+//! displacement and `s` shrinks with the power of `e`: the mean slides to the surface that has most of the weight. The
+//! expected motion is a translation even where the final fit is affine, as an affine map explains a step between two
+//! surfaces too well to let go of either.
+
+use super::moments::{Displacements, FootprintMoments};
+
+/// Residual power of the affine fit over that of the track noise from which a footprint is fitted again: half as much
+/// again, plus three standard deviations of what a sample of the noise has.
+const TRIGGER: f64 = 1.5;
+const TRIGGER_DEVIATIONS: f64 = 3.0;
+/// `s²` over the residual power; three passes at this rate settle 45 % of outliers on one side.
+const SCALE_SQUARED: f64 = 0.64;
+/// Least `s` in standard deviations of the tracks: noise alone is no outlier.
+const LEAST_SIGNIFICANCE: f64 = 3.0;
+/// A pass that leaves less of the weight than this has lost the footprint.
+const LEAST_SHARE: f64 = 1e-3;
+
+/// How often footprints are fitted again, and what counts as noise.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reweighting {
+    /// Passes over the pixels after the first.
+    pub passes: u32,
+    /// Area over which track errors are alike, px², at least 1.
+    pub noise_correlation_area: f64,
+    /// Standard deviation, px, of what the tracks' own variances do not cover.
+    pub noise_floor: f64,
+}
+
+/// The motion that a footprint's pixels are held against: displacement `displacement + gradient (x − centre)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ExpectedMotion {
+    /// Pixels.
+    pub centre: [f64; 2],
+    /// Displacement at the centre, pixels.
+    pub displacement: [f64; 2],
+    /// Rows of its derivative by the pixel.
+    pub gradient: [[f64; 2]; 2],
+    /// `1 / s²`, 1 / px²: a pixel's weight falls by `exp(-|residual|² / s²)`.
+    pub inverse_scale_squared: f64,
+}
+
+impl Reweighting {
+    /// The motion that the next pass expects of a footprint; `None` where its moments stand, as an affine map explains
+    /// its tracks to their own noise.
+    pub fn expected(&self, moments: &FootprintMoments) -> Option<ExpectedMotion> {
+        let displacements = Displacements::of(moments)?;
+        let noise = 2.0 * (displacements.track_variance + self.noise_floor.powi(2));
+        let independent = displacements.independent_pixels(self.noise_correlation_area);
+        let limit = TRIGGER * (1.0 + TRIGGER_DEVIATIONS / independent.sqrt());
+        let is_explained = displacements.affine_residual_power() <= limit * noise;
+        let scale_squared = (SCALE_SQUARED * displacements.power).max(LEAST_SIGNIFICANCE.powi(2) * noise);
+        let is_usable = scale_squared.is_normal() && scale_squared.recip().is_finite();
+        (!is_explained && is_usable).then(|| ExpectedMotion {
+            centre: moments.centroid,
+            displacement: displacements.mean.to_array(),
+            gradient: [[0.0; 2]; 2],
+            inverse_scale_squared: scale_squared.recip(),
+        })
+    }
+}
+
+impl FootprintMoments {
+    /// Takes the moments of a reweighting pass; what counts pixels or all of the blending weight stays, and everything
+    /// does where hardly any weight is left.
+    pub fn reweigh(&mut self, reweighted: Self) {
+        if reweighted.weight > LEAST_SHARE * self.weight && reweighted.weight_squared > 0.0 {
+            let residual = |first: Displacements| 0.5 * first.affine_residual_power();
+            let contest = match self.contest {
+                0.0 => Displacements::of(self).map_or(0.0, residual),
+                first => first,
+            };
+            let Self { blend_weight, visible, pixels, .. } = *self;
+            *self = Self { blend_weight, visible, pixels, contest, ..reweighted };
+        }
+    }
+}

@@ -1,0 +1,383 @@
+//! The sums behind footprint moments, block by block.
+//!
+//! What a pixel says does not depend on the footprint that sees it: its position and its track, both relative to the
+//! block, make one row of sixteen features. The sums of a footprint over a block are then the product of its sixteen
+//! weights with that matrix, one multiplication and addition of a whole group per pixel. Features are relative to the
+//! block's centre and to a displacement that occurs in it, so that single precision suffices; sums over blocks are taken
+//! in double precision.
+
+use super::{
+    ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
+    blend::{BATCH, Band, COLUMNS, Local},
+    blocks::{BLOCK, Entry, corner},
+};
+use crate::{
+    motion::reweighting::ExpectedMotion,
+    simd::{Group, LANES, ROWS, Simd, prefetch, simd_kernel},
+    tracking::TrackField,
+};
+
+/// Standard deviations, px, outside of which a claim is taken for this one: squares of its inverse stay within single
+/// precision.
+const SIGMA: [f32; 2] = [1e-6, 1e6];
+/// Displacement, px, beyond which a track is no track.
+const FARTHEST: f64 = 65_536.0;
+
+/// A pixel's features, in the order of the columns of [`BlockTracks::features`] and of [`Sums`]: with `r` the inverse
+/// variance of its track, `u, v` its position and `a, b` its displacement.
+pub(super) mod feature {
+    /// `r`; then `ru`, `rv`, `ra`, `rb`.
+    pub(crate) const WEIGHT: usize = 0;
+    /// First of `ru`, `rv`.
+    pub(crate) const POSITION: usize = 1;
+    /// First of `ruu`, `ruv`, `rvv`.
+    pub(crate) const SOURCE: usize = 5;
+    /// First of `rau`, `rav`, `rbu`, `rbv`.
+    pub(crate) const CROSS: usize = 8;
+    /// First of `raa`, `rbb`.
+    pub(crate) const POWER: usize = 12;
+    /// One where the track can be used.
+    pub(crate) const VISIBLE: usize = 14;
+    /// One.
+    pub(crate) const BLEND_WEIGHT: usize = 15;
+}
+
+/// Sums of one footprint over its pixels, in image coordinates: blending weight `alpha · T` times each [`feature`], and
+/// two more. Plain numbers, so that a list of zeros costs nothing until it is touched.
+pub(super) type Sums = [f64; SUMS];
+const SUMS: usize = LANES + 2;
+/// `(alpha · T · r)²`.
+pub(super) const WEIGHT_SQUARED: usize = LANES;
+/// Pixels with a usable track.
+pub(super) const PIXELS: usize = LANES + 1;
+
+/// Adds a block's sums, which are relative to its centre and reference, by the parallel-axis theorem.
+#[inline(always)]
+fn add_block(sums: &mut Sums, relative: &[f32; LANES], shift: &Shift) {
+    let (mut m, mut linear) = ([0.0; LANES], [0.0; LANES]);
+    for k in 0..LANES {
+        m[k] = f64::from(relative[k]);
+        linear[k] = m[k];
+    }
+    for k in 0..FACTORS {
+        linear[k] += shift.of_weight[k] * m[0];
+    }
+    for k in 0..LANES {
+        let of_products = shift.relative[k] * m[SECOND[k]] + shift.shifted[k] * linear[FIRST[k]];
+        sums[k] += linear[k] + of_products;
+    }
+}
+
+/// The features of at most one factor, rounded up to half a group.
+const FACTORS: usize = LANES / 2;
+/// Of each feature that is a product of two, the first; any other feature for those that are not.
+const FIRST: [usize; LANES] = [0, 0, 0, 0, 0, 1, 1, 2, 1, 2, 1, 2, 3, 4, 0, 0];
+/// The second.
+const SECOND: [usize; LANES] = [0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4, 4, 3, 4, 0, 0];
+
+/// Factors of the parallel-axis theorem: with `p, q` relative to `P, Q`, a sum of `(p + P)(q + Q)` is that of `pq`, plus
+/// `P` times that of `q`, plus `Q` times that of `p + P`.
+#[derive(Clone, Debug, Default)]
+struct Shift {
+    /// Per feature of one factor: its shift.
+    of_weight: [f64; FACTORS],
+    /// Per product: the shift of its first factor.
+    relative: [f64; LANES],
+    /// Per product: the shift of its second factor.
+    shifted: [f64; LANES],
+}
+
+impl Shift {
+    fn new(centre: [f64; 2], reference: [f64; 2]) -> Self {
+        let by = [0.0, centre[0], centre[1], reference[0], reference[1]];
+        let mut shift = Self::default();
+        shift.of_weight[..by.len()].copy_from_slice(&by);
+        for k in 0..LANES {
+            shift.relative[k] = by[FIRST[k]];
+            shift.shifted[k] = by[SECOND[k]];
+        }
+        shift
+    }
+}
+
+/// What the tracks say on one block.
+#[derive(Default)]
+struct BlockTracks {
+    /// Block centre, pixels.
+    centre: [f64; 2],
+    /// Displacement that the block's displacements are relative to.
+    reference: [f64; 2],
+    /// `1 / σ²` per pixel, zero where the track cannot be used.
+    precision: [f32; LANES],
+    /// Displacement per axis and pixel, relative to the reference; zero where the track cannot be used.
+    displacement: [[f32; LANES]; 2],
+    /// Per pixel its features, positions relative to the block's centre and displacements to the reference.
+    features: [[f32; LANES]; LANES],
+    shift: Shift,
+}
+
+/// Offsets of a block's pixels from its centre.
+fn offset(lane: usize) -> [f32; 2] {
+    let middle = (BLOCK as f32 - 1.0) / 2.0;
+    [(lane % BLOCK) as f32 - middle, (lane / BLOCK) as f32 - middle]
+}
+
+impl BlockTracks {
+    /// Takes the tracks of another block.
+    fn reset(&mut self, band: &Band, block: usize, tracks: &TrackField) {
+        let (column, row) = corner(block);
+        let half = BLOCK as f64 / 2.0;
+        self.centre = [column as f64 + half, (band.first_row + row) as f64 + half];
+        self.precision = [0.0; LANES];
+        self.displacement = [[0.0; LANES]; 2];
+        self.features = [[0.0; LANES]; LANES];
+        let first = band.first_row * band.width;
+        let mut usable = [(0, [0.0; 2]); LANES];
+        let mut count = 0;
+        for (lane, place) in band.pixels(block) {
+            self.features[lane][feature::BLEND_WEIGHT] = 1.0;
+            let pixel = first + place;
+            let [x, y] = tracks.positions[pixel].map(f64::from);
+            let [u, v] = offset(lane).map(f64::from);
+            let displacement = [x - (self.centre[0] + u), y - (self.centre[1] + v)];
+            let sigma = tracks.sigma[pixel];
+            let is_near = displacement[0].abs() <= FARTHEST && displacement[1].abs() <= FARTHEST;
+            // Comparisons with NaN are false.
+            if tracks.visible[pixel] && sigma > 0.0 && sigma < f32::INFINITY && is_near {
+                self.precision[lane] = sigma.clamp(SIGMA[0], SIGMA[1]).powi(2).recip();
+                usable[count] = (lane, displacement);
+                count += 1;
+            }
+        }
+        self.set(&usable[..count]);
+    }
+
+    fn set(&mut self, usable: &[(usize, [f64; 2])]) {
+        if usable.is_empty() {
+            return;
+        }
+        // One that occurs, so that most of a block that straddles two motions, or half of it, is close to it.
+        self.reference = usable[usable.len() / 2].1;
+        self.shift = Shift::new(self.centre, self.reference);
+        for &(lane, displacement) in usable {
+            let [u, v] = offset(lane);
+            let (a, b) =
+                ((displacement[0] - self.reference[0]) as f32, (displacement[1] - self.reference[1]) as f32);
+            let r = self.precision[lane];
+            self.displacement[0][lane] = a;
+            self.displacement[1][lane] = b;
+            let (ra, rb) = (r * a, r * b);
+            self.features[lane] = [
+                r,
+                r * u,
+                r * v,
+                ra,
+                rb,
+                r * (u * u),
+                r * (u * v),
+                r * (v * v),
+                ra * u,
+                ra * v,
+                rb * u,
+                rb * v,
+                ra * a,
+                rb * b,
+                1.0,
+                1.0,
+            ];
+        }
+    }
+}
+
+/// An expected motion as a block's pixels need it.
+struct LocalMotion {
+    /// Expected displacement at the block's centre, relative to the reference.
+    displacement: [f32; 2],
+    /// Its change per column and row.
+    gradient: [[f32; 2]; 2],
+    /// Exponent to base 2 per squared residual.
+    fall: f32,
+}
+
+impl LocalMotion {
+    #[inline(always)]
+    fn new(motion: &ExpectedMotion, tracks: &BlockTracks) -> Self {
+        let [[xu, xv], [yu, yv]] = motion.gradient;
+        let (u, v) = (tracks.centre[0] - motion.centre[0], tracks.centre[1] - motion.centre[1]);
+        let x = motion.displacement[0] + xu * u + xv * v - tracks.reference[0];
+        let y = motion.displacement[1] + yu * u + yv * v - tracks.reference[1];
+        Self {
+            displacement: [x as f32, y as f32],
+            gradient: [[xu as f32, xv as f32], [yu as f32, yv as f32]],
+            fall: (motion.inverse_scale_squared * std::f64::consts::LOG2_E) as f32,
+        }
+    }
+
+    /// The share of each pixel's weight that its residual leaves.
+    #[inline(always)]
+    fn share<S: Simd>(&self, tracks: &BlockTracks, [u, v]: [S; 2]) -> S {
+        let mut squared = S::splat(0.0);
+        for axis in 0..2 {
+            let [by_u, by_v] = self.gradient[axis];
+            let expected = u.mul_add(S::splat(by_u), S::splat(self.displacement[axis]));
+            let expected = v.mul_add(S::splat(by_v), expected);
+            let residual = S::load(&tracks.displacement[axis]).sub(expected);
+            squared = residual.mul_add(residual, squared);
+        }
+        squared.mul(S::splat(-self.fall)).exp2()
+    }
+}
+
+/// The slot of an entry that has none.
+pub(super) const NONE: u32 = u32::MAX;
+
+simd_kernel! {
+    /// Adds the band's shares to `sums`, one for each of its entries; or, if `expected` has any, one for each expectation,
+    /// by which the pixels of its entry are reweighted. `slots` says which belongs to an entry, [`NONE`] that none does.
+    pub(super) fn add_moments(
+        band: &Band,
+        tracks: &TrackField,
+        slots: &[u32],
+        expected: &[ExpectedMotion],
+        sums: &mut [Sums],
+    ) = moments_kernel
+}
+
+#[inline(always)]
+fn moments_kernel<S: Simd>(
+    band: &Band,
+    tracks: &TrackField,
+    slots: &[u32],
+    expected: &[ExpectedMotion],
+    sums: &mut [Sums],
+) {
+    let mut of_block = BlockTracks::default();
+    for block in 0..band.lists.blocks() {
+        let list = band.lists.of(block);
+        let end = if expected.is_empty() {
+            list.len()
+        } else {
+            list.iter().rposition(|&entry| slots[entry as usize] != NONE).map_or(0, |last| last + 1)
+        };
+        if end > 0 {
+            of_block.reset(band, block, tracks);
+            block_moments::<S>(band, block, &list[..end], &of_block, slots, expected, sums);
+        }
+    }
+}
+
+#[inline(always)]
+fn block_moments<S: Simd>(
+    band: &Band,
+    block: usize,
+    list: &[u32],
+    tracks: &BlockTracks,
+    slots: &[u32],
+    expected: &[ExpectedMotion],
+    sums: &mut [Sums],
+) {
+    let entries: &[Entry] = &band.lists.entries;
+    let (column, row) = corner(block);
+    let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
+    let (zero, least) = (S::splat(0.0), S::splat(TRANSMITTANCE_MIN));
+    let middle = S::splat((BLOCK as f32 - 1.0) / 2.0);
+    let mut rows = [0.0; LANES];
+    for (lane, row) in rows.iter_mut().enumerate() {
+        *row = (lane / BLOCK) as f32;
+    }
+    let offsets = [S::load(&COLUMNS).sub(middle), S::load(&rows).sub(middle)];
+    let mut features = [zero; LANES];
+    for (feature, values) in features.iter_mut().zip(&tracks.features) {
+        *feature = S::load(values);
+    }
+    let mut inside = [0.0; LANES];
+    for (inside, values) in inside.iter_mut().zip(&tracks.features) {
+        *inside = values[feature::BLEND_WEIGHT];
+    }
+    let mut running = S::load(&inside);
+    let mut alphas = [zero; BATCH];
+    let mut live = Live::default();
+    for (number, batch) in list.chunks(BATCH).enumerate() {
+        for &later in list.iter().skip((number + 1) * BATCH).take(BATCH) {
+            prefetch(&entries[later as usize]);
+            if expected.is_empty() {
+                prefetch(&sums[later as usize]);
+            }
+        }
+        for (alpha, &entry) in alphas.iter_mut().zip(batch) {
+            let entry = &entries[entry as usize];
+            let value = Local::new(entry, x, y).alpha::<S>(entry).min(S::splat(ALPHA_MAX));
+            *alpha = S::select(value.ge(S::splat(ALPHA_MIN)), value, zero);
+        }
+        live.count = 0;
+        for (&alpha, &entry) in alphas.iter().zip(batch) {
+            // As in `blend`: falls on where blending has stopped.
+            let weight = running.mul(alpha);
+            running = running.sub(weight);
+            let mut weight = S::select(running.ge(least), weight, zero);
+            if !S::any(zero.lt(weight)) {
+                continue;
+            }
+            let mut slot = entry;
+            if !expected.is_empty() {
+                slot = slots[entry as usize];
+                let Some(motion) = expected.get(slot as usize) else { continue };
+                weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks, offsets));
+            }
+            weight.store(&mut live.weights[live.count].0);
+            live.slots[live.count] = slot;
+            live.count += 1;
+        }
+        live.add::<S>(tracks, &features, sums);
+        if !S::any(running.ge(least)) {
+            break;
+        }
+    }
+}
+
+/// The slots of a batch's entries that a block's pixels see, and their weights: kept in memory, from where a weight reaches all
+/// lanes in one instruction.
+#[derive(Default)]
+struct Live {
+    count: usize,
+    slots: [u32; BATCH],
+    weights: [Group; BATCH],
+}
+
+impl Live {
+    #[inline(always)]
+    fn add<S: Simd>(&self, tracks: &BlockTracks, features: &[S; LANES], sums: &mut [Sums]) {
+        let (zero, one) = (S::splat(0.0), S::splat(1.0));
+        let precision = S::load(&tracks.precision);
+        for first in (0..self.count).step_by(ROWS) {
+            // What lies beyond the count is of earlier batches, and not used.
+            let (mut squares, mut counts) = ([zero; ROWS], [zero; ROWS]);
+            for slot in 0..ROWS {
+                let reliable = S::load(&self.weights[first + slot].0).mul(precision);
+                squares[slot] = reliable.mul(reliable);
+                counts[slot] = S::select(zero.lt(reliable), one, zero);
+            }
+            let (mut by_row, mut counted) = ([0.0; LANES], [0.0; LANES]);
+            S::row_sums(squares).store(&mut by_row);
+            S::row_sums(counts).store(&mut counted);
+            for slot in 0..ROWS.min(self.count - first) {
+                let weights = &self.weights[first + slot].0;
+                let mut parts = [zero; 4];
+                for lane in 0..LANES {
+                    parts[lane % 4] = S::splat(weights[lane]).mul_add(features[lane], parts[lane % 4]);
+                }
+                let mut values = [0.0; LANES];
+                parts[0].add(parts[1]).add(parts[2].add(parts[3])).store(&mut values);
+                let sums = &mut sums[self.slots[first + slot] as usize];
+                add_block(sums, &values, &tracks.shift);
+                sums[WEIGHT_SQUARED] += f64::from(column_sum(&by_row, slot));
+                sums[PIXELS] += f64::from(column_sum(&counted, slot));
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn column_sum(rows: &[f32; LANES], column: usize) -> f32 {
+    (rows[column] + rows[ROWS + column]) + (rows[2 * ROWS + column] + rows[3 * ROWS + column])
+}
