@@ -35,8 +35,11 @@ pub(super) struct Fit {
     pub residual: f64,
     /// The 2×2 affine part.
     pub gradient: DMat2,
-    /// Covariance of a row of `gradient`; both rows have the same. That of the affine model whatever the order, as what
-    /// a lower order leaves out is known no better.
+    /// The affine part of the affine model whatever the order, for what only all views together decide: a strain that
+    /// is left out of every view on its own would vote for none.
+    pub affine: DMat2,
+    /// Covariance of a row of `affine`, and of `gradient`, as what a lower order leaves out is known no better; both
+    /// rows have the same.
     pub gradient_covariance: DMat2,
 }
 
@@ -102,6 +105,7 @@ pub(super) fn fit(
         order,
         residual: (0.5 * candidates.residual_power(order)).sqrt(),
         gradient: DMat2::IDENTITY + candidates.gradient(order),
+        affine: DMat2::IDENTITY + if has_extent { candidates.gradient(Order::Affine) } else { DMat2::ZERO },
         gradient_covariance,
     };
     fit.is_finite().then_some(fit)
@@ -143,6 +147,7 @@ impl Fit {
             && self.claimed_variance.is_finite()
             && self.residual.is_finite()
             && self.gradient.is_finite()
+            && self.affine.is_finite()
             && self.gradient_covariance.is_finite()
     }
 }

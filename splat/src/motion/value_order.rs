@@ -62,12 +62,15 @@ impl ValueOrder {
             rotation: vec![DQuat::IDENTITY; count],
             origin: vec![MotionOrigin::Unsolved; count],
             information: vec![DMat3::ZERO; count],
+            log_scale: vec![DVec3::ZERO; count],
+            orders: field.orders,
         };
         for (&index, &place) in self.order.iter().zip(&self.representative) {
             restored.translation[index] = field.translation[place];
             restored.rotation[index] = field.rotation[place];
             restored.origin[index] = field.origin[place];
             restored.information[index] = field.information[place];
+            restored.log_scale[index] = field.log_scale[place];
         }
         restored
     }

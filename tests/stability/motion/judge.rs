@@ -72,6 +72,8 @@ pub(super) fn is_sound(field: &MotionField, count: usize) -> bool {
     let lengths =
         [field.translation.len(), field.rotation.len(), field.origin.len(), field.information.len()];
     lengths == [count; 4]
+        && field.log_scale.len() == count
+        && field.log_scale.iter().all(|scale| scale.is_finite())
         && field.translation.iter().all(|d| d.is_finite())
         && field.rotation.iter().all(|q| q.is_finite() && (q.length() - 1.0).abs() < 1e-9)
         && field.information.iter().all(|h| h.is_finite())

@@ -8,7 +8,10 @@ use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::Gaussians,
-    motion::{MotionOrigin, MotionSettings, MotionView, apply, estimate, moments::FootprintMoments},
+    motion::{
+        MotionOrigin, MotionSettings, MotionView, apply, estimate, moments::FootprintMoments,
+        reweighting::Reweighting,
+    },
     tracking::TrackField,
 };
 
@@ -44,6 +47,7 @@ impl Engine for Points {
         gaussians: &Gaussians,
         camera: &Camera,
         _: &TrackField,
+        _: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         let mut random = random(camera.translation.x.to_bits());
         let mut error = || self.noise * normal(&mut random);
@@ -56,6 +60,8 @@ impl Engine for Points {
             let weight = 4.0 / self.noise.powi(2);
             FootprintMoments {
                 blend_weight: 4.0,
+                visible: 4.0,
+                contest: 0.0,
                 weight,
                 weight_squared: weight * weight / 16.0,
                 pixels: 16,

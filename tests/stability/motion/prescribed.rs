@@ -8,7 +8,7 @@ use splat::{
     cameras::Camera,
     engine::{Engine, EngineError, Rendering, Session, SessionInput},
     gaussians::Gaussians,
-    motion::{MotionView, moments::FootprintMoments},
+    motion::{MotionView, moments::FootprintMoments, reweighting::Reweighting},
     raster::LOW_PASS,
     tracking::TrackField,
 };
@@ -230,7 +230,7 @@ fn hash(seed: u64, mean: DVec3, camera: &Camera) -> u64 {
     })
 }
 
-/// Measures the prescribed footprints of a scene.
+/// Measures the prescribed footprints of a scene, which have one surface each: nothing to weigh again.
 pub(super) struct Prescribed<'a>(pub &'a Scene);
 
 impl Engine for Prescribed<'_> {
@@ -247,6 +247,7 @@ impl Engine for Prescribed<'_> {
         gaussians: &Gaussians,
         camera: &Camera,
         _: &TrackField,
+        _: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         let variance = self.0.noise.deviation().max(LEAST_CLAIM).powi(2);
         let of = |index| moments(&sampled(self.0, gaussians, index, camera, true), variance);
@@ -277,6 +278,7 @@ pub(super) fn moments(samples: &[Sample], variance: f64) -> FootprintMoments {
         m.weight += w;
         m.weight_squared += w * w;
         m.variance += sample.weight;
+        m.visible += sample.weight;
         let add = |sums: &mut [f64], products: &[f64]| {
             sums.iter_mut().zip(products).for_each(|(sum, product)| *sum += w * product);
         };
