@@ -28,6 +28,9 @@ pub(super) struct Fit {
     pub variance: f64,
     /// The part of `variance` that the tracks claim; the rest was found in the residual.
     pub claimed_variance: f64,
+    /// Share of `variance` that is doubt whether the footprint follows the right one of two surfaces, and that other
+    /// views can dispel: not where it follows the smaller part of its pixels.
+    pub doubt: f64,
     /// The model that the tracks support. What a static footprint shows of a displacement is still in `target`: a
     /// Gaussian that moves along one view's ray rests there, and only all views together decide.
     pub order: Order,
@@ -87,6 +90,7 @@ pub(super) fn fit(
     let wrong_surface = moments.contest / kept.max(LEAST_KEPT);
     let claimed_share = if noise > 0.0 { claimed / noise } else { 1.0 };
     let variance = noise / independent_pixels + extrapolation;
+    let undoubted = variance + settings.noise_floor.powi(2);
     let claimed_variance = variance * claimed_share + settings.noise_floor.powi(2);
 
     let is_insignificant = |squared: f64| {
@@ -100,8 +104,13 @@ pub(super) fn fit(
     let fit = Fit {
         target: projected_mean + displacement,
         displacement,
-        variance: variance + wrong_surface + settings.noise_floor.powi(2),
+        variance: undoubted + wrong_surface,
         claimed_variance,
+        doubt: if kept > 0.5 {
+            wrong_surface / (undoubted + wrong_surface).max(f64::MIN_POSITIVE)
+        } else {
+            0.0
+        },
         order,
         residual: (0.5 * candidates.residual_power(order)).sqrt(),
         gradient: DMat2::IDENTITY + candidates.gradient(order),
@@ -145,6 +154,7 @@ impl Fit {
         self.target.is_finite()
             && self.variance.is_finite()
             && self.claimed_variance.is_finite()
+            && self.doubt.is_finite()
             && self.residual.is_finite()
             && self.gradient.is_finite()
             && self.affine.is_finite()

@@ -131,6 +131,10 @@ fn estimate_in_order(
     propagate::retract_unverified(&mut states, &context);
     turn_solved(&mut states, &observations, views, &context);
     propagate::propagate(&mut states, &context);
+    if propagate::accept_doubted(&mut states) {
+        turn_solved(&mut states, &observations, views, &context);
+        propagate::propagate(&mut states, &context);
+    }
     regularize::regularize(&mut states, &context);
     Ok(field(&states, &observations, views, &context))
 }
@@ -147,7 +151,12 @@ fn solve_alone(
     }
     let sightings: Vec<Sighting<'_>> = observations
         .iter()
-        .map(|o| Sighting { camera: &views[o.view].camera, pixel: o.fit.target, variance: o.fit.variance })
+        .map(|o| Sighting {
+            camera: &views[o.view].camera,
+            pixel: o.fit.target,
+            variance: o.fit.variance,
+            doubt: o.fit.doubt,
+        })
         .collect();
     let Some(lift) = lift::solve(&sightings, mean, settings) else {
         return State::unmoved(MotionOrigin::Unsolved, None);

@@ -153,7 +153,8 @@ fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize,
             if error > row.bar.factor * predicted {
                 println!("{}: error {error} of {prediction:?}", row.extreme);
             }
-            row.case(error, predicted);
+            let from_reference = (mean + field.translation[index] - prediction.position).length();
+            row.case(error.max(if told > 0.0 { 0.0 } else { from_reference }), predicted);
         }
         (MotionOrigin::Static, Some(_)) if rests(&sights, mean, settings) => row.case(0.0, 0.0),
         (MotionOrigin::Solved | MotionOrigin::Static, _) => refuse(row, "without grounds", prediction, error),
