@@ -84,21 +84,16 @@ pub(super) fn fit(
     let offset = projected_mean - footprint.centroid;
     let displacement = footprint.mean + candidates.gradient(order) * offset;
     let extrapolation = offset.dot(gradient_covariance * offset).max(0.0);
-    // The Gaussian belongs to the other surface with the probability of its share `1 − kept`; the squared distance of the
-    // two motions is `contest / (kept (1 − kept))`.
-    let kept = kept(moments);
-    let wrong_surface = moments.contest / kept.max(LEAST_KEPT);
     let claimed_share = if noise > 0.0 { claimed / noise } else { 1.0 };
     let variance = noise / independent_pixels + extrapolation;
     let undoubted = variance + settings.noise_floor.powi(2);
+    let wrong_surface = wrong_surface(moments);
+    let total = (undoubted + wrong_surface).max(f64::MIN_POSITIVE);
     let claimed_variance = variance * claimed_share + settings.noise_floor.powi(2);
 
-    let is_insignificant = |squared: f64| {
-        squared <= settings.static_significance.powi(2) * claimed_variance
-            || squared <= settings.static_floor.powi(2)
-    };
-    let is_static = kept >= UNCONTESTED
-        && is_insignificant(displacement.length_squared())
+    let still = (settings.static_significance.powi(2) * claimed_variance).max(settings.static_floor.powi(2));
+    let is_static = kept(moments) >= UNCONTESTED
+        && displacement.length_squared() <= still
         && candidates.is_rigid(claimed, independent_pixels, settings);
     let order = if is_static { Order::Static } else { order };
     let fit = Fit {
@@ -106,11 +101,7 @@ pub(super) fn fit(
         displacement,
         variance: undoubted + wrong_surface,
         claimed_variance,
-        doubt: if kept > 0.5 {
-            wrong_surface / (undoubted + wrong_surface).max(f64::MIN_POSITIVE)
-        } else {
-            0.0
-        },
+        doubt: if kept(moments) > 0.5 { wrong_surface / total } else { 0.0 },
         order,
         residual: (0.5 * candidates.residual_power(order)).sqrt(),
         gradient: DMat2::IDENTITY + candidates.gradient(order),
@@ -131,6 +122,12 @@ fn is_observed(moments: &FootprintMoments, settings: &MotionSettings) -> bool {
 fn kept(moments: &FootprintMoments) -> f64 {
     // `Σ w σ²` with `w = alpha T / σ²` is a sum of blending weights.
     moments.variance / moments.visible
+}
+
+/// Variance per axis, px², of which of two surfaces the Gaussian belongs to: to the other one with the probability of its
+/// share `1 − kept`, at a squared distance of `contest / (kept (1 − kept))`.
+fn wrong_surface(moments: &FootprintMoments) -> f64 {
+    moments.contest / kept(moments).max(LEAST_KEPT)
 }
 
 fn ridge(noise: f64, pixels: f64, settings: &MotionSettings) -> f64 {

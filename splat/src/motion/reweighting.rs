@@ -30,15 +30,11 @@ pub struct Reweighting {
     pub noise_floor: f64,
 }
 
-/// The motion that a footprint's pixels are held against: displacement `displacement + gradient (x − centre)`.
+/// The motion that a footprint's pixels are held against: a translation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ExpectedMotion {
     /// Pixels.
-    pub centre: [f64; 2],
-    /// Displacement at the centre, pixels.
     pub displacement: [f64; 2],
-    /// Rows of its derivative by the pixel.
-    pub gradient: [[f64; 2]; 2],
     /// `1 / s²`, 1 / px²: a pixel's weight falls by `exp(-|residual|² / s²)`.
     pub inverse_scale_squared: f64,
 }
@@ -55,9 +51,7 @@ impl Reweighting {
         let scale_squared = (SCALE_SQUARED * displacements.power).max(LEAST_SIGNIFICANCE.powi(2) * noise);
         let is_usable = scale_squared.is_normal() && scale_squared.recip().is_finite();
         (!is_explained && is_usable).then(|| ExpectedMotion {
-            centre: moments.centroid,
             displacement: displacements.mean.to_array(),
-            gradient: [[0.0; 2]; 2],
             inverse_scale_squared: scale_squared.recip(),
         })
     }

@@ -8,7 +8,7 @@
 
 use super::{
     ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN,
-    blend::{BATCH, Band, COLUMNS, Local},
+    blend::{BATCH, Band, Local},
     blocks::{BLOCK, Entry, corner},
 };
 use crate::{
@@ -191,10 +191,8 @@ impl BlockTracks {
 
 /// An expected motion as a block's pixels need it.
 struct LocalMotion {
-    /// Expected displacement at the block's centre, relative to the reference.
+    /// Relative to the reference.
     displacement: [f32; 2],
-    /// Its change per column and row.
-    gradient: [[f32; 2]; 2],
     /// Exponent to base 2 per squared residual.
     fall: f32,
 }
@@ -202,26 +200,19 @@ struct LocalMotion {
 impl LocalMotion {
     #[inline(always)]
     fn new(motion: &ExpectedMotion, tracks: &BlockTracks) -> Self {
-        let [[xu, xv], [yu, yv]] = motion.gradient;
-        let (u, v) = (tracks.centre[0] - motion.centre[0], tracks.centre[1] - motion.centre[1]);
-        let x = motion.displacement[0] + xu * u + xv * v - tracks.reference[0];
-        let y = motion.displacement[1] + yu * u + yv * v - tracks.reference[1];
+        let [x, y] = motion.displacement;
         Self {
-            displacement: [x as f32, y as f32],
-            gradient: [[xu as f32, xv as f32], [yu as f32, yv as f32]],
+            displacement: [(x - tracks.reference[0]) as f32, (y - tracks.reference[1]) as f32],
             fall: (motion.inverse_scale_squared * std::f64::consts::LOG2_E) as f32,
         }
     }
 
     /// The share of each pixel's weight that its residual leaves.
     #[inline(always)]
-    fn share<S: Simd>(&self, tracks: &BlockTracks, [u, v]: [S; 2]) -> S {
+    fn share<S: Simd>(&self, tracks: &BlockTracks) -> S {
         let mut squared = S::splat(0.0);
         for axis in 0..2 {
-            let [by_u, by_v] = self.gradient[axis];
-            let expected = u.mul_add(S::splat(by_u), S::splat(self.displacement[axis]));
-            let expected = v.mul_add(S::splat(by_v), expected);
-            let residual = S::load(&tracks.displacement[axis]).sub(expected);
+            let residual = S::load(&tracks.displacement[axis]).sub(S::splat(self.displacement[axis]));
             squared = residual.mul_add(residual, squared);
         }
         squared.mul(S::splat(-self.fall)).exp2()
@@ -280,12 +271,6 @@ fn block_moments<S: Simd>(
     let (column, row) = corner(block);
     let (x, y) = (column as f64 + 0.5, (band.first_row + row) as f64 + 0.5);
     let (zero, least) = (S::splat(0.0), S::splat(TRANSMITTANCE_MIN));
-    let middle = S::splat((BLOCK as f32 - 1.0) / 2.0);
-    let mut rows = [0.0; LANES];
-    for (lane, row) in rows.iter_mut().enumerate() {
-        *row = (lane / BLOCK) as f32;
-    }
-    let offsets = [S::load(&COLUMNS).sub(middle), S::load(&rows).sub(middle)];
     let mut features = [zero; LANES];
     for (feature, values) in features.iter_mut().zip(&tracks.features) {
         *feature = S::load(values);
@@ -322,7 +307,7 @@ fn block_moments<S: Simd>(
             if !expected.is_empty() {
                 slot = slots[entry as usize];
                 let Some(motion) = expected.get(slot as usize) else { continue };
-                weight = weight.mul(LocalMotion::new(motion, tracks).share(tracks, offsets));
+                weight = weight.mul(LocalMotion::new(motion, tracks).share::<S>(tracks));
             }
             weight.store(&mut live.weights[live.count].0);
             live.slots[live.count] = slot;

@@ -1,7 +1,10 @@
 //! Runs the shipped path on a scene and holds every Gaussian to its prediction.
 
 use glam::DVec3;
-use splat::motion::{MotionField, MotionOrigin, MotionSettings, estimate};
+use splat::{
+    gaussians::Gaussians,
+    motion::{MotionField, MotionOrigin, MotionSettings, apply, estimate},
+};
 
 use super::{
     prescribed::{Prescribed, Scene, Tracked},
@@ -83,6 +86,17 @@ pub(super) fn is_sound(field: &MotionField, count: usize) -> bool {
         })
 }
 
+/// Whether moved Gaussians are where the field says, to the rounding of single precision, and what was finite still is.
+fn is_applied(gaussians: &Gaussians, field: &MotionField) -> bool {
+    let moved = apply(gaussians, field);
+    (0..gaussians.len()).filter(|&index| gaussians.is_finite(index)).all(|index| {
+        let expected = gaussians.mean(index) + field.translation[index];
+        let rounding = expected.abs() * f64::from(f32::EPSILON) / 2.0;
+        let error = (moved.mean(index) - expected).abs();
+        moved.is_finite(index) && error.cmple(rounding + f64::from(f32::MIN_POSITIVE)).all()
+    })
+}
+
 /// What the data demand of a lone Gaussian's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Demand {
@@ -126,6 +140,9 @@ pub(super) fn together(row: &mut Row, scene: &Scene) -> Origins {
 pub(super) fn judge_all(row: &mut Row, scene: &impl Tracked, field: &MotionField, settings: &MotionSettings) {
     if !is_sound(field, scene.gaussians().len()) {
         row.case(f64::NAN, 1.0);
+    }
+    if !is_applied(scene.gaussians(), field) {
+        row.case(f64::INFINITY, 0.0);
     }
     for index in 0..scene.gaussians().len() {
         judge(row, scene, field, index, settings);

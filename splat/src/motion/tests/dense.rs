@@ -121,9 +121,7 @@ fn robust_moments(blend: &Blend, tracks: &TrackField, reweighting: &Reweighting)
 
 /// What a pixel keeps of its weight.
 fn share(expected: &ExpectedMotion, source: DVec2, target: DVec2) -> f64 {
-    let offset = source - DVec2::from_array(expected.centre);
-    let gradient = expected.gradient.map(|row| DVec2::from_array(row).dot(offset));
-    let residual = target - source - DVec2::from_array(expected.displacement) - DVec2::from_array(gradient);
+    let residual = target - source - DVec2::from_array(expected.displacement);
     (-residual.length_squared() * expected.inverse_scale_squared).exp()
 }
 
