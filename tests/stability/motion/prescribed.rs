@@ -92,19 +92,7 @@ pub(super) struct Stray {
 
 impl Scene {
     pub(super) fn views(&self) -> Vec<MotionView> {
-        let (width, height) = self.cameras.first().map_or((1, 1), |camera| (camera.width, camera.height));
-        let pixels = width as usize * height as usize;
-        let tracks = Arc::new(TrackField {
-            width,
-            height,
-            positions: vec![[0.5; 2]; pixels],
-            visible: vec![true; pixels],
-            sigma: vec![1.0; pixels],
-        });
-        self.cameras
-            .iter()
-            .map(|camera| MotionView { camera: camera.clone(), tracks: Arc::clone(&tracks) })
-            .collect()
+        unread_tracks(&self.cameras)
     }
 }
 
@@ -228,6 +216,17 @@ fn hash(seed: u64, mean: DVec3, camera: &Camera) -> u64 {
     values.fold(seed ^ 0xcbf2_9ce4_8422_2325, |hash, value| {
         (hash ^ value.to_bits()).wrapping_mul(0x0100_0000_01b3).rotate_left(29)
     })
+}
+
+/// Views whose tracks have a size but no pixels, for engines that do not read them.
+pub(super) fn unread_tracks(cameras: &[Camera]) -> Vec<MotionView> {
+    let view = |camera: &Camera| {
+        let (width, height) = (camera.width, camera.height);
+        let (positions, visible, sigma) = (Vec::new(), Vec::new(), Vec::new());
+        let tracks = Arc::new(TrackField { width, height, positions, visible, sigma });
+        MotionView { camera: camera.clone(), tracks }
+    };
+    cameras.iter().map(view).collect()
 }
 
 /// Measures the prescribed footprints of a scene, which have one surface each: nothing to weigh again.
