@@ -28,6 +28,9 @@ pub(super) struct Fit {
     pub variance: f64,
     /// The part of `variance` that the tracks claim; the rest was found in the residual.
     pub claimed_variance: f64,
+    /// Share of `variance` that is doubt whether the footprint follows the right one of two surfaces, and that other
+    /// views can dispel: not where it follows the smaller part of its pixels.
+    pub doubt: f64,
     /// The model that the tracks support. What a static footprint shows of a displacement is still in `target`: a
     /// Gaussian that moves along one view's ray rests there, and only all views together decide.
     pub order: Order,
@@ -35,8 +38,11 @@ pub(super) struct Fit {
     pub residual: f64,
     /// The 2×2 affine part.
     pub gradient: DMat2,
-    /// Covariance of a row of `gradient`; both rows have the same. That of the affine model whatever the order, as what
-    /// a lower order leaves out is known no better.
+    /// The affine part of the affine model whatever the order, for what only all views together decide: a strain that
+    /// is left out of every view on its own would vote for none.
+    pub affine: DMat2,
+    /// Covariance of a row of `affine`, and of `gradient`, as what a lower order leaves out is known no better; both
+    /// rows have the same.
     pub gradient_covariance: DMat2,
 }
 
@@ -80,6 +86,9 @@ pub(super) fn fit(
     let extrapolation = offset.dot(gradient_covariance * offset).max(0.0);
     let claimed_share = if noise > 0.0 { claimed / noise } else { 1.0 };
     let variance = noise / independent_pixels + extrapolation;
+    let undoubted = variance + settings.noise_floor.powi(2);
+    let wrong_surface = wrong_surface(moments);
+    let total = (undoubted + wrong_surface).max(f64::MIN_POSITIVE);
     let claimed_variance = variance * claimed_share + settings.noise_floor.powi(2);
 
     let still = (settings.static_significance.powi(2) * claimed_variance).max(settings.static_floor.powi(2));
@@ -90,11 +99,13 @@ pub(super) fn fit(
     let fit = Fit {
         target: projected_mean + displacement,
         displacement,
-        variance: variance + wrong_surface(moments) + settings.noise_floor.powi(2),
+        variance: undoubted + wrong_surface,
         claimed_variance,
+        doubt: if kept(moments) > 0.5 { wrong_surface / total } else { 0.0 },
         order,
         residual: (0.5 * candidates.residual_power(order)).sqrt(),
         gradient: DMat2::IDENTITY + candidates.gradient(order),
+        affine: DMat2::IDENTITY + if has_extent { candidates.gradient(Order::Affine) } else { DMat2::ZERO },
         gradient_covariance,
     };
     fit.is_finite().then_some(fit)
@@ -140,8 +151,10 @@ impl Fit {
         self.target.is_finite()
             && self.variance.is_finite()
             && self.claimed_variance.is_finite()
+            && self.doubt.is_finite()
             && self.residual.is_finite()
             && self.gradient.is_finite()
+            && self.affine.is_finite()
             && self.gradient_covariance.is_finite()
     }
 }

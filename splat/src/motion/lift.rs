@@ -24,6 +24,8 @@ pub(super) struct Sighting<'a> {
     pub pixel: DVec2,
     /// Variance per axis, px².
     pub variance: f64,
+    /// Share of `variance` that is doubt whether the pixel lies on the right surface.
+    pub doubt: f64,
 }
 
 /// A solved position.
@@ -38,6 +40,8 @@ pub(super) struct Lift {
     /// Whether the views alone determine the position; otherwise neighbours must supply the missing
     /// directions.
     pub is_determined: bool,
+    /// Whether they would without the doubt of their footprints; views that agree in spite of it speak against it.
+    pub is_determined_if_undoubted: bool,
 }
 
 /// Triangulates a displaced mean by Gauss-Newton on pixels, robust to views whose track is wrong.
@@ -69,6 +73,7 @@ pub(super) fn solve(sightings: &[Sighting<'_>], mean: DVec3, settings: &MotionSe
     (2 * inliers.len() > everyone.len()).then(|| problem.lift(position, inliers)).flatten()
 }
 
+#[derive(Clone, Copy)]
 struct Problem<'a> {
     sightings: &'a [Sighting<'a>],
     mean: DVec3,
@@ -96,7 +101,7 @@ impl Problem<'_> {
         let mut normal = DMat3::from_diagonal(DVec3::splat(self.prior_precision(members)));
         let mut right = DVec3::ZERO;
         for &member in members {
-            let Sighting { camera, pixel, variance } = self.sightings[member];
+            let Sighting { camera, pixel, variance, .. } = self.sightings[member];
             let slope = DVec3::new((pixel.x - camera.cx) / camera.fx, (pixel.y - camera.cy) / camera.fy, 1.0);
             let ray = (camera.rotation.transpose() * slope).normalize();
             let depth = camera.to_camera(self.mean).z;
@@ -217,27 +222,48 @@ impl Problem<'_> {
         (core.len() >= 2).then_some(core)
     }
 
-    fn lift(&self, position: DVec3, inliers: Vec<usize>) -> Option<Lift> {
-        if !self.is_in_front(position, &inliers) {
-            return None;
-        }
-        let (normal, _) = self.normal_equations(position, &inliers);
+    /// The normal matrix, divided by the misfit where the views disagree more than they claim.
+    fn information(&self, position: DVec3, inliers: &[usize]) -> DMat3 {
+        let (normal, _) = self.normal_equations(position, inliers);
         let chi_squared: f64 = inliers
             .iter()
             .filter_map(|&m| Some(self.residual(position, m)?.length_squared() / self.sightings[m].variance))
             .sum();
         let freedom = (2.0 * inliers.len() as f64 - 3.0).max(1.0);
-        let information = normal * (1.0 / (chi_squared / freedom).max(1.0));
+        normal * (1.0 / (chi_squared / freedom).max(1.0))
+    }
+
+    /// The information if every footprint follows the right surface.
+    fn undoubted_information(&self, position: DVec3, inliers: &[usize]) -> DMat3 {
+        let undoubted: Vec<Sighting<'_>> = self
+            .sightings
+            .iter()
+            .map(|seen| Sighting { variance: seen.variance * (1.0 - seen.doubt), doubt: 0.0, ..*seen })
+            .collect();
+        Problem { sightings: &undoubted, ..*self }.information(position, inliers)
+    }
+
+    fn lift(&self, position: DVec3, inliers: Vec<usize>) -> Option<Lift> {
+        if !self.is_in_front(position, &inliers) {
+            return None;
+        }
+        let information = self.information(position, &inliers);
         let depth = self.sightings[inliers[0]].camera.to_camera(position).z;
-        let largest_deviation = self.settings.max_relative_deviation * depth;
-        let is_determined = inliers.len() >= self.settings.min_views.max(2)
-            && is_above(information, largest_deviation.powi(-2));
+        let least = (self.settings.max_relative_deviation * depth).powi(-2);
+        let are_enough = inliers.len() >= self.settings.min_views.max(2);
+        let is_determined = are_enough && is_above(information, least);
+        // Two views always agree with a point somewhere along the epipolar line.
+        let is_determined_if_undoubted = is_determined
+            || are_enough
+                && inliers.len() > 2
+                && is_above(self.undoubted_information(position, &inliers), least);
         let translation = position - self.mean;
         (translation.is_finite() && information.is_finite()).then_some(Lift {
             translation,
             information,
             inliers,
             is_determined,
+            is_determined_if_undoubted,
         })
     }
 }

@@ -175,6 +175,10 @@ fn estimate_in_order(
     turn_solved(&mut states, &observations, views, &context);
     entered(MotionStage::Propagate);
     propagate::propagate(&mut states, &context);
+    if propagate::accept_doubted(&mut states) {
+        turn_solved(&mut states, &observations, views, &context);
+        propagate::propagate(&mut states, &context);
+    }
     entered(MotionStage::Regularise);
     regularize::regularize(&mut states, &context);
     Ok(field(&states, &observations, views, &context))
@@ -192,7 +196,12 @@ fn solve_alone(
     }
     let sightings: Vec<Sighting<'_>> = observations
         .iter()
-        .map(|o| Sighting { camera: &views[o.view].camera, pixel: o.fit.target, variance: o.fit.variance })
+        .map(|o| Sighting {
+            camera: &views[o.view].camera,
+            pixel: o.fit.target,
+            variance: o.fit.variance,
+            doubt: o.fit.doubt,
+        })
         .collect();
     let Some(lift) = lift::solve(&sightings, mean, settings) else {
         return State::unmoved(MotionOrigin::Unsolved, None);

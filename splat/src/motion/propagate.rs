@@ -148,6 +148,20 @@ fn deviation(state: &State) -> f64 {
     if trace.is_finite() { 3.0 * trace.max(0.0).sqrt() } else { 0.0 }
 }
 
+/// Takes positions that only doubt about the surfaces under their footprints left unsolved, where no neighbour
+/// knows better; whether there are any.
+pub(super) fn accept_doubted(states: &mut [State]) -> bool {
+    let mut any = false;
+    for state in states.iter_mut().filter(|state| state.origin == MotionOrigin::Unsolved) {
+        if let Some(own) = state.own.take_if(|own| own.is_determined_if_undoubted) {
+            let solved = State::unmoved(MotionOrigin::Solved, None);
+            *state = State { translation: own.translation, own: Some(own), ..solved };
+            any = true;
+        }
+    }
+    any
+}
+
 /// Fills unsolved Gaussians from agreeing neighbours, one ring of neighbours per hop.
 ///
 /// Each hop reads the states before it, so that the result does not depend on the order of the Gaussians.

@@ -274,7 +274,7 @@ fn lift_axis(
         if variance <= 0.0 || variance.is_nan() {
             continue;
         }
-        let seen = fit.gradient * projected;
+        let seen = fit.affine * projected;
         information += (outer(new_u, new_u) + outer(new_v, new_v)) * variance.recip();
         right += (new_u * (seen.x - new_u.dot(axis)) + new_v * (seen.y - new_v.dot(axis))) * variance.recip();
     }

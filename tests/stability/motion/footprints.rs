@@ -15,7 +15,7 @@ use super::{
 use crate::row::Row;
 
 /// Lone Gaussians per row.
-const CASES: u64 = 20;
+const CASES: u64 = 12;
 
 /// The usual rig before a smaller image; a pixel of it is four of the rig's.
 const PIXEL: f64 = 4.0;

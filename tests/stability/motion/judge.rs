@@ -1,7 +1,10 @@
 //! Runs the shipped path on a scene and holds every Gaussian to its prediction.
 
 use glam::DVec3;
-use splat::motion::{MotionField, MotionOrigin, MotionSettings, estimate};
+use splat::{
+    gaussians::Gaussians,
+    motion::{MotionField, MotionOrigin, MotionSettings, apply, estimate},
+};
 
 use super::{
     prescribed::{Prescribed, Scene, Tracked},
@@ -72,6 +75,8 @@ pub(super) fn is_sound(field: &MotionField, count: usize) -> bool {
     let lengths =
         [field.translation.len(), field.rotation.len(), field.origin.len(), field.information.len()];
     lengths == [count; 4]
+        && field.log_scale.len() == count
+        && field.log_scale.iter().all(|scale| scale.is_finite())
         && field.translation.iter().all(|d| d.is_finite())
         && field.rotation.iter().all(|q| q.is_finite() && (q.length() - 1.0).abs() < 1e-9)
         && field.information.iter().all(|h| h.is_finite())
@@ -79,6 +84,17 @@ pub(super) fn is_sound(field: &MotionField, count: usize) -> bool {
             let stays = matches!(field.origin[i], MotionOrigin::Static | MotionOrigin::Unsolved);
             !stays || (field.translation[i] == DVec3::ZERO && field.rotation[i] == glam::DQuat::IDENTITY)
         })
+}
+
+/// Whether moved Gaussians are where the field says, to the rounding of single precision, and what was finite still is.
+fn is_applied(gaussians: &Gaussians, field: &MotionField) -> bool {
+    let moved = apply(gaussians, field);
+    (0..gaussians.len()).filter(|&index| gaussians.is_finite(index)).all(|index| {
+        let expected = gaussians.mean(index) + field.translation[index];
+        let rounding = expected.abs() * f64::from(f32::EPSILON) / 2.0;
+        let error = (moved.mean(index) - expected).abs();
+        moved.is_finite(index) && error.cmple(rounding + f64::from(f32::MIN_POSITIVE)).all()
+    })
 }
 
 /// What the data demand of a lone Gaussian's origin.
@@ -125,6 +141,9 @@ pub(super) fn judge_all(row: &mut Row, scene: &impl Tracked, field: &MotionField
     if !is_sound(field, scene.gaussians().len()) {
         row.case(f64::NAN, 1.0);
     }
+    if !is_applied(scene.gaussians(), field) {
+        row.case(f64::INFINITY, 0.0);
+    }
     for index in 0..scene.gaussians().len() {
         judge(row, scene, field, index, settings);
     }
@@ -151,7 +170,8 @@ fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize,
             if error > row.bar.factor * predicted {
                 println!("{}: error {error} of {prediction:?}", row.extreme);
             }
-            row.case(error, predicted);
+            let from_reference = (mean + field.translation[index] - prediction.position).length();
+            row.case(error.max(if told > 0.0 { 0.0 } else { from_reference }), predicted);
         }
         (MotionOrigin::Static, Some(_)) if rests(&sights, mean, settings) => row.case(0.0, 0.0),
         (MotionOrigin::Solved | MotionOrigin::Static, _) => refuse(row, "without grounds", prediction, error),

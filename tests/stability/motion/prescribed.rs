@@ -92,19 +92,7 @@ pub(super) struct Stray {
 
 impl Scene {
     pub(super) fn views(&self) -> Vec<MotionView> {
-        let (width, height) = self.cameras.first().map_or((1, 1), |camera| (camera.width, camera.height));
-        let pixels = width as usize * height as usize;
-        let tracks = Arc::new(TrackField {
-            width,
-            height,
-            positions: vec![[0.5; 2]; pixels],
-            visible: vec![true; pixels],
-            sigma: vec![1.0; pixels],
-        });
-        self.cameras
-            .iter()
-            .map(|camera| MotionView { camera: camera.clone(), tracks: Arc::clone(&tracks) })
-            .collect()
+        unread_tracks(&self.cameras)
     }
 }
 
@@ -230,7 +218,18 @@ fn hash(seed: u64, mean: DVec3, camera: &Camera) -> u64 {
     })
 }
 
-/// Measures the prescribed footprints of a scene.
+/// Views whose tracks have a size but no pixels, for engines that do not read them.
+pub(super) fn unread_tracks(cameras: &[Camera]) -> Vec<MotionView> {
+    let view = |camera: &Camera| {
+        let (width, height) = (camera.width, camera.height);
+        let (positions, visible, sigma) = (Vec::new(), Vec::new(), Vec::new());
+        let tracks = Arc::new(TrackField { width, height, positions, visible, sigma });
+        MotionView { camera: camera.clone(), tracks }
+    };
+    cameras.iter().map(view).collect()
+}
+
+/// Measures the prescribed footprints of a scene, which have one surface each: nothing to weigh again.
 pub(super) struct Prescribed<'a>(pub &'a Scene);
 
 impl Engine for Prescribed<'_> {
@@ -279,6 +278,7 @@ pub(super) fn moments(samples: &[Sample], variance: f64) -> FootprintMoments {
         m.weight += w;
         m.weight_squared += w * w;
         m.variance += sample.weight;
+        m.visible += sample.weight;
         let add = |sums: &mut [f64], products: &[f64]| {
             sums.iter_mut().zip(products).for_each(|(sum, product)| *sum += w * product);
         };

@@ -208,7 +208,14 @@ fn bits(field: &MotionField, index: usize) -> Vec<u64> {
     let translation = field.translation[index].to_array();
     let (rotation, information) =
         (field.rotation[index].to_array(), field.information[index].to_cols_array());
-    translation.iter().chain(&rotation).chain(&information).map(|value| value.to_bits()).collect()
+    let log_scale = field.log_scale[index].to_array();
+    translation
+        .iter()
+        .chain(&rotation)
+        .chain(&information)
+        .chain(&log_scale)
+        .map(|value| value.to_bits())
+        .collect()
 }
 
 #[test]

@@ -22,7 +22,7 @@ pub(super) struct Sight<'a> {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Prediction {
     /// Least squares over all right views.
-    position: DVec3,
+    pub position: DVec3,
     /// Standard deviation of `position`, all directions together.
     pub deviation: f64,
     /// Standard deviation in the worst direction that the shipped path may assume.

@@ -78,7 +78,12 @@ fn far_displacements_are_triangulated() {
     for count in [2, 3, 8] {
         let sightings: Vec<lift::Sighting<'_>> = rig[..count]
             .iter()
-            .map(|camera| lift::Sighting { camera, pixel: camera.project_world(to).unwrap(), variance: 0.01 })
+            .map(|camera| lift::Sighting {
+                camera,
+                pixel: camera.project_world(to).unwrap(),
+                variance: 0.01,
+                doubt: 0.0,
+            })
             .collect();
         let lift = lift::solve(&sightings, from, &settings()).unwrap();
         assert!((from + lift.translation - to).length() < 1e-6, "{count}: {}", lift.translation);
@@ -91,8 +96,12 @@ fn few_views_say_what_they_know() {
     let rig = cameras(2);
     let (from, to) = (DVec3::splat(0.3), DVec3::new(0.4, 0.35, 0.2));
     assert_eq!(lift::solve(&[], from, &settings()), None);
-    let sighting =
-        |camera| lift::Sighting { camera, pixel: rig[0].project_world(to).unwrap(), variance: 0.01 };
+    let sighting = |camera| lift::Sighting {
+        camera,
+        pixel: rig[0].project_world(to).unwrap(),
+        variance: 0.01,
+        doubt: 0.0,
+    };
     for same in [vec![sighting(&rig[0])], vec![sighting(&rig[0]), sighting(&rig[0])]] {
         let lift = lift::solve(&same, from, &settings()).unwrap();
         assert!(!lift.is_determined, "depth is not seen");
@@ -110,7 +119,7 @@ fn contradicting_pair_is_refused() {
     let to = DVec3::splat(0.4);
     let wrong = rig[1].project_world(to).unwrap() + DVec2::new(0.0, 20.0);
     let sightings = [(&rig[0], rig[0].project_world(to).unwrap()), (&rig[1], wrong)]
-        .map(|(camera, pixel)| lift::Sighting { camera, pixel, variance: 0.01 });
+        .map(|(camera, pixel)| lift::Sighting { camera, pixel, variance: 0.01, doubt: 0.0 });
     assert_eq!(lift::solve(&sightings, DVec3::splat(0.3), &settings()), None);
 }
 
