@@ -9,6 +9,7 @@ pub mod ids;
 #[allow(
     missing_docs,
     clippy::doc_markdown,
+    clippy::large_enum_variant,
     clippy::allow_attributes_without_reason,
     reason = "generated from documented .proto files"
 )]

@@ -13,8 +13,8 @@ use crate::{
 
 const BAR: Bar = Bar {
     unit: "of the class's largest",
-    factor: 2.0,
-    why: "2⁻²⁴ through every pixel's weight and the moments of it that make the gradient",
+    factor: 3.0,
+    why: "2⁻²⁴ through every pixel's weight and the moments of it that make the gradient, whose offsets are rounded once more from the tile's centre",
 };
 
 /// Parameter classes and their places among the geometry; the harmonics have none.

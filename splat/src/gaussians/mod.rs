@@ -103,8 +103,7 @@ impl Gaussians {
     }
 }
 
-/// A stored `w, x, y, z` quaternion as a unit quaternion; the identity for zero or non-finite input. The rasterizer does not draw
-/// a Gaussian whose quaternion has a NaN; sessions refuse it.
+/// A stored `w, x, y, z` quaternion as a unit quaternion; the identity for zero or non-finite input.
 ///
 /// Works in f64 after dividing by the largest component, so that norms from 1e-20 to 1e20 neither vanish nor
 /// overflow when squared.

@@ -70,10 +70,9 @@ fn the_place_in_a_group_changes_nothing() {
 #[test]
 fn a_neighbour_that_is_not_drawn_changes_nothing() {
     let whole = coloured(20, 3);
-    let breaks: [fn(&mut Gaussians); 7] = [
+    let breaks: [fn(&mut Gaussians); 6] = [
         |g| g.means[5] = [f32::NAN; 3],
         |g| g.means[5][2] = -10.0,
-        |g| g.rotations[5] = [f32::NAN, 1.0, 0.0, 0.0],
         |g| g.log_scales[5] = [f32::INFINITY, 0.0, 0.0],
         |g| g.log_scales[5] = [800.0; 3],
         |g| g.logit_opacities[5] = f32::NAN,
@@ -101,7 +100,7 @@ fn rotations_without_direction_are_the_identity_and_get_no_gradient() {
     plain.rotations[2] = [1.0, 0.0, 0.0, 0.0];
     for instructions in Instructions::available() {
         let expected = gradients(instructions, &plain);
-        for rotation in [[0.0; 4], [f32::INFINITY, 0.0, 0.0, 0.0], [0.0, f32::NEG_INFINITY, 1.0, 0.0]] {
+        for rotation in [[0.0; 4], [f32::INFINITY, 0.0, 0.0, 0.0], [0.3, f32::NAN, 0.1, 0.2]] {
             let mut gaussians = plain.clone();
             gaussians.rotations[2] = rotation;
             let found = gradients(instructions, &gaussians);

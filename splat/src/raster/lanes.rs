@@ -97,12 +97,12 @@ pub(super) fn dots<D: Doubles>(vectors: &[Vector<D>; 3], other: Vector<D>) -> Ve
 pub(super) struct Rotation<D> {
     /// `w, x, y, z`.
     pub unit: [D; 4],
-    /// Zero or infinite where the stored quaternion has no direction.
+    /// Zero or no finite number where the stored quaternion has no direction.
     pub norm: D,
 }
 
 impl<D: Doubles> Rotation<D> {
-    /// Of stored quaternions `w, x, y, z`; the identity for zero or infinite ones.
+    /// Of stored quaternions `w, x, y, z`; the identity for those that are zero or no finite number.
     ///
     /// Squares of single-precision numbers neither vanish nor overflow in double precision.
     #[inline(always)]
@@ -111,13 +111,12 @@ impl<D: Doubles> Rotation<D> {
         let squared = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
         let norm = squared.sqrt();
         let inverse = one / norm;
-        // NaN stays, so that projection drops the Gaussian.
-        let is_identity = D::either(zero.ge(norm), norm.ge(D::splat(f64::INFINITY)));
+        let has_direction = D::both(norm.gt(zero), norm.is_finite());
         let unit = [
-            D::select(is_identity, one, w * inverse),
-            D::select(is_identity, zero, x * inverse),
-            D::select(is_identity, zero, y * inverse),
-            D::select(is_identity, zero, z * inverse),
+            D::select(has_direction, w * inverse, one),
+            D::select(has_direction, x * inverse, zero),
+            D::select(has_direction, y * inverse, zero),
+            D::select(has_direction, z * inverse, zero),
         ];
         Self { unit, norm }
     }

@@ -270,7 +270,6 @@ pub(super) fn moments(samples: &[Sample], variance: f64) -> FootprintMoments {
     let mean = |of: fn(&Sample) -> DVec2| visible.iter().map(|s| of(s) * s.weight).sum::<DVec2>() / weight;
     let (source, target) = (mean(|s| s.from), mean(|s| s.to));
     m.pixels = visible.len() as u32;
-    m.visible = weight;
     (m.centroid, m.tracked_centroid) = (source.to_array(), target.to_array());
     for sample in visible {
         let w = sample.weight / variance;
