@@ -61,7 +61,10 @@ impl Report {
             .map(|cell| format!("{}, {}, {} %", cell.motion, cell.rig, 100.0 * cell.noise))
             .collect();
         if short.is_empty() {
-            return format!("Robust is better in every cell, in rotation by {ROTATION_GAIN} times at least.");
+            return format!(
+                "Robust is better in every cell, in rotation by {ROTATION_GAIN} times at least; solved is compared with the \
+                 released path's rotations."
+            );
         }
         format!("Not better, or in rotation by less than {ROTATION_GAIN} times: {}.", short.join("; "))
     }

@@ -78,7 +78,7 @@ pub struct ViewMetrics {
 /// How many Gaussians got their motion from where.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MotionCounts {
-    /// Did not move; frozen in refinement.
+    /// Did not move.
     pub r#static: usize,
     /// Solved from their own footprints.
     pub solved: usize,

@@ -62,7 +62,7 @@ use value_order::ValueOrder;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MotionOrigin {
-    /// Its footprints do not move beyond the track noise; frozen downstream.
+    /// Its footprints do not move beyond the track noise, or those of its neighbours if its own say nothing.
     Static,
     /// Solved from its own footprints.
     Solved,

@@ -75,8 +75,11 @@ pub(super) fn observe(
 /// The tracks without those that claim to see a point outside of the image.
 fn within_image<'a>(camera: &Camera, tracks: &'a TrackField) -> Cow<'a, TrackField> {
     let is_inside = |position: &[f32; 2]| camera.contains(DVec2::from_array(position.map(f64::from)));
-    let leave: Vec<usize> = (0..tracks.visible.len())
-        .filter(|&p| tracks.visible[p] && !is_inside(&tracks.positions[p]))
+    // The engine refuses fields whose parts differ in length.
+    let pixels = tracks.visible.iter().zip(&tracks.positions).enumerate();
+    let leave: Vec<usize> = pixels
+        .filter(|(_, (visible, position))| **visible && !is_inside(position))
+        .map(|(pixel, _)| pixel)
         .collect();
     if leave.is_empty() {
         return Cow::Borrowed(tracks);
@@ -99,7 +102,8 @@ pub fn within_mask(tracks: &TrackField, mask: &Mask) -> TrackField {
     for (visible, position) in tracks.visible.iter_mut().zip(&tracks.positions) {
         let [x, y] = position.map(f64::from);
         let is_in_image = x >= 0.0 && y >= 0.0 && x < width && y < height;
-        *visible &= is_in_image && mask.inside[y as usize * mask.width as usize + x as usize];
+        let inside = || mask.inside.get(y as usize * mask.width as usize + x as usize) == Some(&true);
+        *visible &= is_in_image && inside();
     }
     tracks
 }

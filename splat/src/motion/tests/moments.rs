@@ -171,7 +171,12 @@ fn lone(size: f64) -> (Gaussians, Camera) {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(24))]
+    #![proptest_config(ProptestConfig {
+        cases: 24,
+        rng_seed: proptest::test_runner::RngSeed::Fixed(4),
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
 
     /// A footprint of which up to 40 % show another surface follows its own; so does one with up to 70 % of
     /// its tracks at random.
