@@ -99,7 +99,7 @@ impl Stages {
     pub(crate) fn descend(&mut self) {
         let rates = rates(self.gaussians.sh_degree);
         let camera = &self.scene.camera;
-        self.pass.descend(&mut self.gaussians, camera, &rates, &[], &mut self.adam, &mut self.density);
+        self.pass.descend(&mut self.gaussians, camera, &rates, &mut self.adam, &mut self.density);
     }
 }
 

@@ -39,7 +39,7 @@ impl CpuEngine {
         pass.forward(gaussians, camera, degree, background, &mut image, &mut []);
         pass.blend_backward(camera, background, image_gradient, alpha_gradient);
         let mut gradients = GaussianGradients::zeros(gaussians);
-        pass.project_backward(gaussians, camera, degree, &[], &mut gradients);
+        pass.project_backward(gaussians, camera, degree, &mut gradients);
         gradients
     }
 }

@@ -145,13 +145,13 @@ fn the_fused_step_is_the_gradient_and_then_the_step() {
         for active in [&[][..], &some] {
             let apart = stepped(&start, active, |pass, gaussians, view, adam, _| {
                 let mut gradients = GaussianGradients::zeros(gaussians);
-                pass.project_backward(gaussians, &cameras[view], RATES.sh_degree, active, &mut gradients);
+                pass.project_backward(gaussians, &cameras[view], RATES.sh_degree, &mut gradients);
                 adam.step(gaussians, &gradients, &RATES, (!active.is_empty()).then_some(active));
             });
             for threads in [1, 3] {
                 let fused = || {
                     stepped(&start, active, |pass, gaussians, view, adam, density| {
-                        pass.descend(gaussians, &cameras[view], &RATES, active, adam, density);
+                        pass.descend(gaussians, &cameras[view], &RATES, adam, density);
                     })
                 };
                 let (gaussians, density) = on_threads(threads, fused);

@@ -122,11 +122,10 @@ impl Pass {
         gaussians: &Gaussians,
         camera: &Camera,
         sh_degree: u32,
-        active: &[bool],
         gradients: &mut GaussianGradients,
     ) {
         let instructions = self.instructions;
-        let backward = self.backward(View::new(camera, gaussians, sh_degree), active);
+        let backward = self.backward(View::new(camera, gaussians, sh_degree));
         gradients.parts_mut(CHUNK).enumerate().for_each(|(chunk, gradients)| {
             let first = chunk * CHUNK;
             let part = gaussians.part().slice(first..first + gradients.means.len());
@@ -135,18 +134,17 @@ impl Pass {
     }
 
     /// Stages 5 and 6 in one, without the memory of the gradients: a step of Adam with the gradient by every parameter of
-    /// the active Gaussians (empty: all). Adds to the density statistics.
+    /// the active Gaussians. Adds to the density statistics.
     pub fn descend(
         &self,
         gaussians: &mut Gaussians,
         camera: &Camera,
         rates: &LearningRates,
-        active: &[bool],
         adam: &mut Adam,
         density: &mut DensityStatistics,
     ) {
         let instructions = self.instructions;
-        let backward = self.backward(View::new(camera, gaussians, rates.sh_degree), active);
+        let backward = self.backward(View::new(camera, gaussians, rates.sh_degree));
         let descent = adam.begin_step(gaussians, rates);
         let density = DensityPart::parts(density, CHUNK, [camera.width, camera.height]);
         adam.parts(gaussians, CHUNK).zip(density).enumerate().for_each(|(chunk, (part, density))| {
@@ -154,7 +152,7 @@ impl Pass {
         });
     }
 
-    fn backward<'a>(&'a self, view: View<'a>, active: &'a [bool]) -> Backward<'a> {
-        Backward { view, bins: &self.bins, bands: &self.bands, active }
+    fn backward<'a>(&'a self, view: View<'a>) -> Backward<'a> {
+        Backward { view, bins: &self.bins, bands: &self.bands, active: &self.active }
     }
 }

@@ -85,14 +85,7 @@ impl Session for CpuSession {
         self.pass.blend(camera, self.background, &self.active, &mut self.rendered, &mut []);
         let value = loss.evaluate(&self.rendered, &mut self.workspace, &mut self.image_gradient);
         self.pass.blend_backward(camera, self.background, &self.image_gradient, &[]);
-        self.pass.descend(
-            &mut self.gaussians,
-            camera,
-            rates,
-            &self.active,
-            &mut self.adam,
-            &mut self.density,
-        );
+        self.pass.descend(&mut self.gaussians, camera, rates, &mut self.adam, &mut self.density);
         self.losses.push(value);
         Ok(())
     }

@@ -332,7 +332,7 @@ fn frozen_gaussians_leave_the_gradients_of_the_others_as_they_are() {
         pass.blend(camera, BLACK, active, &mut image, &mut []);
         pass.blend_backward(camera, BLACK, &seeds, &[]);
         let mut gradients = GaussianGradients::zeros(&gaussians);
-        pass.project_backward(&gaussians, camera, degree, active, &mut gradients);
+        pass.project_backward(&gaussians, camera, degree, &mut gradients);
         gradients
     };
     let all = gradients(&[]);
@@ -375,7 +375,7 @@ fn in_rounds(gaussians: &Gaussians, limit: RoundLimit, instructions: Instruction
     pass.forward(gaussians, camera, degree, background, &mut image, &mut alpha);
     pass.blend_backward(camera, background, &seeds, &seeds[..70 * 45]);
     let mut gradients = GaussianGradients::zeros(gaussians);
-    pass.project_backward(gaussians, camera, degree, &[], &mut gradients);
+    pass.project_backward(gaussians, camera, degree, &mut gradients);
     ([image.pixels, alpha].concat(), flat(&gradients))
 }
 
