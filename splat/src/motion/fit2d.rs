@@ -11,39 +11,42 @@ use super::{
 /// An expected strain of zero asks for translations only; this is as good and keeps the ridge finite.
 const LEAST_STRAIN: f64 = 1e-6;
 
-/// Share of its visible weight that a footprint must keep in reweighting to be found at rest: what straddles something
-/// that moves may be part of it.
+/// Share of its visible weight that a footprint must keep in reweighting to be found at rest, unless it is the noise that
+/// lost it: what straddles something that moves may be part of it.
 const UNCONTESTED: f64 = 0.9;
+/// Share of what the affine model left at first that another surface must explain to contest a footprint.
+const CONTESTED: f64 = 0.5;
 /// Where reweighting left less than this, the other surface's distance is not estimated from it.
 const LEAST_KEPT: f64 = 0.01;
+/// How much the variance of tracks may exceed their claim, where no other surface explains it, before a footprint counts
+/// as moving: twice the deviations.
+const MOST_EXCESS: f64 = 4.0;
+/// px², far below any pixel's size: where a footprint has no extent its affine map is known to nothing instead of infinitely
+/// badly.
+const LEAST_EXTENT: f64 = 1e-9;
 
 /// How a footprint moves: `x ↦ target + gradient · (x − m)` about the projected mean `m`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Fit {
     /// Where the projected mean goes, pixels.
     pub target: DVec2,
-    /// `target` minus the projected mean.
-    pub displacement: DVec2,
     /// Variance of `target` per axis, px².
     pub variance: f64,
-    /// The part of `variance` that the tracks claim; the rest was found in the residual.
-    pub claimed_variance: f64,
+    /// The part of `variance` that the tracks claim, or err by without another surface's doing.
+    pub resting_variance: f64,
     /// Share of `variance` that is doubt whether the footprint follows the right one of two surfaces, and that other
     /// views can dispel: not where it follows the smaller part of its pixels.
     pub doubt: f64,
     /// The model that the tracks support. What a static footprint shows of a displacement is still in `target`: a
     /// Gaussian that moves along one view's ray rests there, and only all views together decide.
     pub order: Order,
-    /// Root mean square per axis of what the model leaves, pixels.
-    pub residual: f64,
-    /// The 2×2 affine part.
+    /// The 2×2 affine part of the chosen model.
     pub gradient: DMat2,
-    /// The affine part of the affine model whatever the order, for what only all views together decide: a strain that
-    /// is left out of every view on its own would vote for none.
+    /// The affine part by least squares, whatever the order and without any expectation, for what only all views
+    /// together decide: what every view leaves out, or pulls towards no strain, would be counted once per view.
     pub affine: DMat2,
-    /// Covariance of a row of `affine`, and of `gradient`, as what a lower order leaves out is known no better; both
-    /// rows have the same.
-    pub gradient_covariance: DMat2,
+    /// Covariance of a row of `affine`; both rows have the same.
+    pub affine_covariance: DMat2,
 }
 
 /// Fits the footprint's motion and evaluates it at the Gaussian's own projected mean.
@@ -54,59 +57,60 @@ pub(super) struct Fit {
 pub(super) fn fit(
     moments: &FootprintMoments,
     projected_mean: DVec2,
-    image_size: DVec2,
     settings: &MotionSettings,
 ) -> Option<Fit> {
     if !is_observed(moments, settings) {
         return None;
     }
     let footprint = Displacements::of(moments)?;
-    let has_extent = determinant_ndc(&footprint, image_size) >= settings.min_determinant;
+    let contest = Contest::of(moments, &footprint);
     let independent_pixels = footprint.independent_pixels(settings.noise_correlation_area);
 
     // The tracker's own variance sets the first ridge; the residual may then reveal more noise than it
     // claims.
     let claimed = footprint.track_variance;
     let first = Candidates::new(&footprint, ridge(claimed, independent_pixels, settings));
-    let noise = claimed.max(residual_variance(first.affine_residual_power(), footprint.pixels));
+    let found = residual_variance(first.affine_residual_power(), footprint.pixels) / contest.kept;
+    let noise = claimed.max(found);
     let ridge = ridge(noise, independent_pixels, settings);
     let candidates = Candidates::new(&footprint, ridge);
+    let has_extent = footprint.source.determinant() >= settings.min_footprint_area.powi(2);
     let order = match has_extent {
         true => candidates.select(noise, independent_pixels),
         false => Order::Translation,
     };
 
-    let regularised = footprint.source + DMat2::from_diagonal(DVec2::splat(ridge));
-    let gradient_covariance = match has_extent {
-        true => regularised.inverse() * (noise / independent_pixels),
-        false => DMat2::from_diagonal(DVec2::splat(settings.expected_strain.powi(2))),
-    };
+    let pixel_variance = noise / independent_pixels;
     let offset = projected_mean - footprint.centroid;
     let displacement = footprint.mean + candidates.gradient(order) * offset;
-    let extrapolation = offset.dot(gradient_covariance * offset).max(0.0);
-    let claimed_share = if noise > 0.0 { claimed / noise } else { 1.0 };
-    let variance = noise / independent_pixels + extrapolation;
-    let undoubted = variance + settings.noise_floor.powi(2);
-    let wrong_surface = wrong_surface(moments);
-    let total = (undoubted + wrong_surface).max(f64::MIN_POSITIVE);
-    let claimed_variance = variance * claimed_share + settings.noise_floor.powi(2);
+    let expected = (footprint.source + DMat2::from_diagonal(DVec2::splat(ridge))).inverse() * pixel_variance;
+    let extrapolation = match has_extent {
+        true => offset.dot(expected * offset).max(0.0),
+        false => offset.length_squared() * settings.expected_strain.powi(2),
+    };
+    let variance = pixel_variance + extrapolation;
+    let floor = settings.noise_floor.powi(2);
+    let wrong_surface = contest.wrong_surface();
+    let total = (variance + floor + wrong_surface).max(f64::MIN_POSITIVE);
 
-    let still = (settings.static_significance.powi(2) * claimed_variance).max(settings.static_floor.powi(2));
-    let is_static = kept(moments) >= UNCONTESTED
+    let resting = if contest.is_contested() { claimed } else { noise.min(MOST_EXCESS * claimed) };
+    let resting_share = if noise > 0.0 { resting / noise } else { 1.0 };
+    let resting_variance = variance * resting_share + floor;
+    let still = (settings.static_significance.powi(2) * resting_variance).max(settings.static_floor.powi(2));
+    let is_static = !contest.is_contested()
         && displacement.length_squared() <= still
-        && candidates.is_rigid(claimed, independent_pixels, settings);
-    let order = if is_static { Order::Static } else { order };
+        && candidates.is_rigid(resting, independent_pixels, settings);
+
+    let extent = footprint.source + DMat2::from_diagonal(DVec2::splat(LEAST_EXTENT));
     let fit = Fit {
         target: projected_mean + displacement,
-        displacement,
-        variance: undoubted + wrong_surface,
-        claimed_variance,
-        doubt: if kept(moments) > 0.5 { wrong_surface / total } else { 0.0 },
-        order,
-        residual: (0.5 * candidates.residual_power(order)).sqrt(),
+        variance: variance + floor + wrong_surface,
+        resting_variance,
+        doubt: if contest.kept > 0.5 { wrong_surface / total } else { 0.0 },
+        order: if is_static { Order::Static } else { order },
         gradient: DMat2::IDENTITY + candidates.gradient(order),
-        affine: DMat2::IDENTITY + if has_extent { candidates.gradient(Order::Affine) } else { DMat2::ZERO },
-        gradient_covariance,
+        affine: DMat2::IDENTITY + footprint.strain * extent.inverse(),
+        affine_covariance: extent.inverse() * pixel_variance,
     };
     fit.is_finite().then_some(fit)
 }
@@ -118,25 +122,39 @@ fn is_observed(moments: &FootprintMoments, settings: &MotionSettings) -> bool {
         && moments.visible > settings.min_visible_share * moments.blend_weight
 }
 
-/// Share of the visible blending weight that reweighting left.
-fn kept(moments: &FootprintMoments) -> f64 {
-    // `Σ w σ²` with `w = alpha T / σ²` is a sum of blending weights.
-    moments.variance / moments.visible
+/// What reweighting tells of another surface in the footprint.
+#[derive(Clone, Copy, Debug)]
+struct Contest {
+    /// Share of the visible blending weight that reweighting left, in (0, 1].
+    kept: f64,
+    /// What the affine model left before, px² per axis.
+    before: f64,
+    /// The part of it that one surface's noise does not explain: Welsch weights keep the same share of normal errors'
+    /// weight and of their power, but of two surfaces' power next to nothing.
+    between: f64,
 }
 
-/// Variance per axis, px², of which of two surfaces the Gaussian belongs to: to the other one with the probability of its
-/// share `1 − kept`, at a squared distance of `contest / (kept (1 − kept))`.
-fn wrong_surface(moments: &FootprintMoments) -> f64 {
-    moments.contest / kept(moments).max(LEAST_KEPT)
+impl Contest {
+    fn of(moments: &FootprintMoments, footprint: &Displacements) -> Self {
+        // `Σ w σ²` with `w = alpha T / σ²` is a sum of blending weights.
+        let kept = (moments.variance / moments.visible).clamp(LEAST_KEPT, 1.0);
+        let after = 0.5 * footprint.affine_residual_power();
+        Self { kept, before: moments.contest, between: (moments.contest - after / kept).max(0.0) }
+    }
+
+    fn is_contested(&self) -> bool {
+        self.kept < UNCONTESTED && self.between > CONTESTED * self.before
+    }
+
+    /// Variance per axis, px², of which of two surfaces the Gaussian belongs to: to the other one with the probability of
+    /// its share `1 − kept`, at a squared distance of `between / (kept (1 − kept))`.
+    fn wrong_surface(&self) -> f64 {
+        self.between / self.kept
+    }
 }
 
 fn ridge(noise: f64, pixels: f64, settings: &MotionSettings) -> f64 {
     noise / (pixels * settings.expected_strain.max(LEAST_STRAIN).powi(2))
-}
-
-fn determinant_ndc(footprint: &Displacements, image_size: DVec2) -> f64 {
-    let scale = 4.0 / (image_size.x * image_size.y);
-    footprint.source.determinant() * scale * scale
 }
 
 /// Unbiased variance per axis of what the affine model leaves of both; zero where nothing is left to estimate
@@ -150,11 +168,10 @@ impl Fit {
     fn is_finite(&self) -> bool {
         self.target.is_finite()
             && self.variance.is_finite()
-            && self.claimed_variance.is_finite()
+            && self.resting_variance.is_finite()
             && self.doubt.is_finite()
-            && self.residual.is_finite()
             && self.gradient.is_finite()
             && self.affine.is_finite()
-            && self.gradient_covariance.is_finite()
+            && self.affine_covariance.is_finite()
     }
 }

@@ -73,6 +73,16 @@ pub(super) fn solve(sightings: &[Sighting<'_>], mean: DVec3, settings: &MotionSe
     (2 * inliers.len() > everyone.len()).then(|| problem.lift(position, inliers)).flatten()
 }
 
+/// A position that the sightings `voters` find unchanged.
+pub(super) fn at_rest(
+    sightings: &[Sighting<'_>],
+    voters: Vec<usize>,
+    mean: DVec3,
+    settings: &MotionSettings,
+) -> Option<Lift> {
+    Problem { sightings, mean, settings }.lift(mean, voters)
+}
+
 #[derive(Clone, Copy)]
 struct Problem<'a> {
     sightings: &'a [Sighting<'a>],

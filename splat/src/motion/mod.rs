@@ -62,13 +62,14 @@ use value_order::ValueOrder;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MotionOrigin {
-    /// Its footprints do not move beyond the track noise, or those of its neighbours if its own say nothing.
+    /// Its footprints do not move beyond the track noise; or those of its neighbours do not, where its own views say
+    /// nothing against it but do not determine where it is.
     Static,
     /// Solved from its own footprints.
     Solved,
     /// Taken from its neighbours' field.
     Propagated,
-    /// Neither: it stays where it was.
+    /// Neither: it stays as it was.
     Unsolved,
 }
 
@@ -87,7 +88,7 @@ pub struct MotionField {
     pub turns_harmonics: bool,
     /// Change of the logarithm of each Gaussian's scales, along its own axes; zero unless significant.
     pub log_scale: Vec<glam::DVec3>,
-    /// Which models the footprints got.
+    /// Which models the footprints got; all zero on the reference path, which knows affine maps only.
     pub orders: OrderCounts,
 }
 
@@ -144,11 +145,12 @@ pub fn estimate_staged(
     settings: &MotionSettings,
     entered: &mut dyn FnMut(MotionStage),
 ) -> Result<MotionField, EngineError> {
-    if settings.lift == LiftMethod::Reference {
-        return reference::estimate(engine, gaussians, views);
-    }
     let order = ValueOrder::of(gaussians);
-    let field = estimate_in_order(engine, &order.sorted(gaussians), views, settings, entered)?;
+    let sorted = order.sorted(gaussians);
+    let field = match settings.lift {
+        LiftMethod::Robust => estimate_in_order(engine, &sorted, views, settings, entered)?,
+        LiftMethod::Reference => reference::estimate(engine, &sorted, views)?,
+    };
     Ok(order.restored(field))
 }
 
@@ -175,8 +177,11 @@ fn estimate_in_order(
     turn_solved(&mut states, &observations, views, &context);
     entered(MotionStage::Propagate);
     propagate::propagate(&mut states, &context);
-    if propagate::accept_doubted(&mut states) {
+    let has_accepted = propagate::accept_doubted(&mut states);
+    if has_accepted {
         turn_solved(&mut states, &observations, views, &context);
+    }
+    if propagate::accept_resting(&mut states) || has_accepted {
         propagate::propagate(&mut states, &context);
     }
     entered(MotionStage::Regularise);
@@ -191,9 +196,6 @@ fn solve_alone(
     views: &[MotionView],
     settings: &MotionSettings,
 ) -> State {
-    if static_test::is_at_rest(observations, settings) {
-        return State::unmoved(MotionOrigin::Static, None);
-    }
     let sightings: Vec<Sighting<'_>> = observations
         .iter()
         .map(|o| Sighting {
@@ -203,6 +205,12 @@ fn solve_alone(
             doubt: o.fit.doubt,
         })
         .collect();
+    if let Some(voters) = static_test::voters_for_rest(observations, settings) {
+        let own = lift::at_rest(&sightings, voters, mean, settings);
+        let is_determined = own.as_ref().is_some_and(|own| own.is_determined);
+        let origin = if is_determined { MotionOrigin::Static } else { MotionOrigin::Unsolved };
+        return State { is_seen_at_rest: true, ..State::unmoved(origin, own) };
+    }
     let Some(lift) = lift::solve(&sightings, mean, settings) else {
         return State::unmoved(MotionOrigin::Unsolved, None);
     };
@@ -256,31 +264,13 @@ fn field(
     views: &[MotionView],
     context: &Context<'_>,
 ) -> MotionField {
-    let information = |index: usize| match &states[index].own {
-        Some(own) => own.information,
-        None if states[index].origin == MotionOrigin::Static => {
-            resting_information(context.gaussians.mean(index), &observations[index], views)
-        }
-        None => DMat3::ZERO,
-    };
     MotionField {
         translation: states.iter().map(|state| state.translation).collect(),
         rotation: states.iter().map(|state| state.rotation).collect(),
         origin: states.iter().map(|state| state.origin).collect(),
-        information: (0..states.len()).into_par_iter().map(information).collect(),
+        information: states.iter().map(|s| s.own.as_ref().map_or(DMat3::ZERO, |own| own.information)).collect(),
         turns_harmonics: true,
         log_scale: strain::log_strains(states, observations, views, context),
         orders: OrderCounts::of(observations.iter().flatten().map(|observation| observation.fit.order)),
     }
-}
-
-/// `Σ TᵀT / σ²` at a mean that stays.
-fn resting_information(mean: DVec3, observations: &[Observation], views: &[MotionView]) -> DMat3 {
-    let mut information = DMat3::ZERO;
-    for Observation { view, fit, .. } in observations {
-        let camera = &views[*view].camera;
-        let [u, v] = camera.world_jacobian(camera.to_camera(mean));
-        information += (linear::outer(u, u) + linear::outer(v, v)) * fit.variance.recip();
-    }
-    information
 }

@@ -120,8 +120,7 @@ fn observation(
     }
     let position = camera.to_camera(gaussians.mean(index));
     let projected = camera.project(position)?;
-    let size = DVec2::new(camera.width.into(), camera.height.into());
-    let fit = fit2d::fit(moments, projected, size, settings)?;
+    let fit = fit2d::fit(moments, projected, settings)?;
     if !camera.contains(fit.target) {
         return None;
     }

@@ -21,12 +21,14 @@ pub(super) struct State {
     /// What its own footprints say: of a solved Gaussian everything, of another the directions that were
     /// seen.
     pub own: Option<Lift>,
+    /// Whether most of its own views find it at rest.
+    pub is_seen_at_rest: bool,
 }
 
 impl State {
     /// Neither moved nor turned.
     pub(super) fn unmoved(origin: MotionOrigin, own: Option<Lift>) -> Self {
-        Self { origin, translation: DVec3::ZERO, rotation: DQuat::IDENTITY, own }
+        Self { origin, translation: DVec3::ZERO, rotation: DQuat::IDENTITY, own, is_seen_at_rest: false }
     }
 
     fn is_known(&self) -> bool {
@@ -162,6 +164,17 @@ pub(super) fn accept_doubted(states: &mut [State]) -> bool {
     any
 }
 
+/// Lets Gaussians rest that their own views see at rest without determining where they are, and of which no neighbour
+/// knows better; whether there are any.
+pub(super) fn accept_resting(states: &mut [State]) -> bool {
+    let mut any = false;
+    for state in states.iter_mut().filter(|state| !state.is_known() && state.is_seen_at_rest) {
+        state.origin = MotionOrigin::Static;
+        any = true;
+    }
+    any
+}
+
 /// Fills unsolved Gaussians from agreeing neighbours, one ring of neighbours per hop.
 ///
 /// Each hop reads the states before it, so that the result does not depend on the order of the Gaussians.
@@ -189,8 +202,9 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
         return None;
     }
     let are_at_rest = consensus.members.iter().all(|n| states[n.index].origin == MotionOrigin::Static);
-    if are_at_rest && states[index].own.is_none() {
-        return Some(State::unmoved(MotionOrigin::Static, None));
+    let State { own, is_seen_at_rest, .. } = &states[index];
+    if are_at_rest && (own.is_none() || *is_seen_at_rest) {
+        return Some(State { origin: MotionOrigin::Static, ..states[index].clone() });
     }
     let indirect = context.indirect_information();
     let members: Vec<Member> = consensus
@@ -211,16 +225,14 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
         context.settings,
     );
     let deviation = context.prediction_deviation(&consensus.members);
-    let seen =
-        states[index].own.as_ref().map(|own| (own, pull(own, translation, deviation, context.settings)));
-    let own = match seen {
-        Some((own, Some(pull))) => {
-            translation += pull;
-            Some(own.clone())
-        }
-        _ => None,
-    };
-    Some(State { origin: MotionOrigin::Propagated, translation, rotation, own })
+    let pull = own.as_ref().and_then(|own| pull(own, translation, deviation, context.settings));
+    if *is_seen_at_rest && pull.is_none() {
+        // Neighbours of another body.
+        return Some(State { origin: MotionOrigin::Static, ..states[index].clone() });
+    }
+    translation += pull.unwrap_or(DVec3::ZERO);
+    let own = own.clone().filter(|_| pull.is_some());
+    Some(State { origin: MotionOrigin::Propagated, translation, rotation, own, is_seen_at_rest: false })
 }
 
 /// How far what a Gaussian's own views see moves it from its neighbours' prediction, whose standard deviation is

@@ -269,7 +269,7 @@ fn lift_axis(
         let [u, v] = camera.world_jacobian(camera.to_camera(old_mean));
         let [new_u, new_v] = camera.world_jacobian(camera.to_camera(new_mean));
         let projected = glam::DVec2::new(u.dot(axis), v.dot(axis));
-        let noise = projected.dot(fit.gradient_covariance * projected);
+        let noise = projected.dot(fit.affine_covariance * projected);
         let variance = noise + (off_surface * projected.length()).powi(2);
         if variance <= 0.0 || variance.is_nan() {
             continue;
@@ -283,6 +283,8 @@ fn lift_axis(
     let ridge = DMat3::from_diagonal(DVec3::splat(1e-9 * trace));
     let to = axis + (information + ridge).inverse() * right;
     let is_lifted = trace > 0.0 && to.is_finite() && information.is_finite() && to.length_squared() > 0.0;
-    // The length is strain, not rotation.
-    is_lifted.then(|| TurnedAxis { from: axis, to: to.normalize(), information })
+    // The length is strain, not rotation. What came out short turns by more for the same error; what came out long may
+    // be nothing but noise.
+    let precision = to.length_squared().min(1.0);
+    is_lifted.then(|| TurnedAxis { from: axis, to: to.normalize(), information: information * precision })
 }

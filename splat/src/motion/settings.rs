@@ -31,9 +31,9 @@ pub struct MotionSettings {
     /// Least number of visible pixels of a footprint that counts as observed; default 2, as in the public
     /// code.
     pub min_pixels: u32,
-    /// Least determinant of a footprint's covariance, in normalised device coordinates, for an affine fit;
-    /// below it only the translation is fitted. Default 1e-12, as in the public code (0.06 px² at 640×360).
-    pub min_determinant: f64,
+    /// Least `√det` of a footprint's covariance, px², for a model beyond a translation; default 0.06, what the public
+    /// code asks for at 640×360.
+    pub min_footprint_area: f64,
     /// Least visible share of a footprint's blending weight, 0 to 1; default 0.6. Where most of it vanishes,
     /// what remains is likely another surface at its rim.
     pub min_visible_share: f64,
@@ -69,7 +69,8 @@ pub struct MotionSettings {
     /// Reprojection error, px, that is never an outlier; default 1: a Gaussian's mean lies off the tracked
     /// surface.
     pub outlier_floor: f64,
-    /// Largest standard deviation of a solved position, as a share of its depth; default 0.005. Beyond it the
+    /// Largest standard deviation of a position that a Gaussian's own views determine, be it at rest or not, as a share of its
+    /// depth; default 0.02. Beyond it the
     /// neighbours decide: footprints that straddle two motions know neither.
     pub max_relative_deviation: f64,
     /// Expected rotation, standard deviation in radians; default 1. Ties weakly determined rotations to none.
@@ -119,7 +120,7 @@ impl MotionSettings {
             lift: LiftMethod::default(),
             min_blend_weight: 1e-3,
             min_pixels: 2,
-            min_determinant: 1e-12,
+            min_footprint_area: 0.06,
             min_visible_share: 0.6,
             min_relative_transmittance: 0.1,
             min_views: 2,

@@ -2,20 +2,22 @@
 
 use super::{MotionSettings, observe::Observation, order::Order};
 
-/// Whether most of the views that see a Gaussian find it at rest.
+/// The observations that find a Gaussian at rest, by their index, if they have most of the weight.
 ///
 /// A view finds it at rest if the order of its footprint's motion is [`Order::Static`]: displacement and strain are
-/// insignificant against the noise that the tracks claim, or below an absolute floor. Noise that only the residual
-/// reveals is no excuse: a footprint of two motions moves. A view votes by the share of the Gaussian that it sees and by
-/// the sharpness of what it sees.
-pub(super) fn is_at_rest(observations: &[Observation], settings: &MotionSettings) -> bool {
+/// insignificant against the noise of the tracks, or below an absolute floor. What another surface in the footprint makes
+/// of the noise is no excuse: a footprint of two motions moves. A view votes by the share of the Gaussian that it sees
+/// and by the sharpness of what it sees.
+pub(super) fn voters_for_rest(observations: &[Observation], settings: &MotionSettings) -> Option<Vec<usize>> {
     let (mut at_rest, mut all) = (0.0, 0.0);
-    for Observation { fit, transmittance, .. } in observations {
-        let sharpness = 1.0 / (fit.claimed_variance + settings.static_floor.powi(2)).max(f64::MIN_POSITIVE);
+    let mut voters = Vec::new();
+    for (index, Observation { fit, transmittance, .. }) in observations.iter().enumerate() {
+        let sharpness = 1.0 / (fit.resting_variance + settings.static_floor.powi(2)).max(f64::MIN_POSITIVE);
         if fit.order == Order::Static {
             at_rest += sharpness * transmittance;
+            voters.push(index);
         }
         all += sharpness * transmittance;
     }
-    all > 0.0 && at_rest > settings.static_share * all
+    (all > 0.0 && at_rest > settings.static_share * all).then_some(voters)
 }

@@ -84,8 +84,8 @@ impl Line {
                 let camera = &views[*view].camera;
                 let before = in_view(camera, self.mean, self.axis);
                 let expected = in_view(camera, self.moved, self.turned);
-                let variance = before.dot(fit.gradient_covariance * before);
-                (variance > 0.0).then(|| (expected, fit.gradient * before, variance))
+                let variance = before.dot(fit.affine_covariance * before);
+                (variance > 0.0).then(|| (expected, fit.affine * before, variance))
             })
             .collect();
         let (mut information, mut right) = (0.0, 0.0);

@@ -14,7 +14,8 @@
 //! away, Gaussians at rest anchor nobody, harmonics do not turn.
 //!
 //! Where the description calls something an accident of the released kernels, the evident intent stands here:
-//! every filled Gaussian passes its motion on, whatever its index, and the eight nearest neighbours are exact.
+//! every filled Gaussian passes its motion on, whatever its index, the order of the Gaussians does not matter, the eight
+//! nearest neighbours are exact, and what no translation reaches does not turn either.
 //! Solves run in double precision where the released code uses single (singular values, eigenvectors), cameras
 //! keep their principal point, and what comes out as no number counts as not solved. So this is, if anything,
 //! better than what was released.

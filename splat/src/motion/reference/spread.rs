@@ -46,8 +46,9 @@ pub(super) fn spread(gaussians: &Gaussians, own: &OwnMotion) -> Result<Spread, E
             .map(|(turn, confidence)| (if turn.w < 0.0 { -turn } else { turn }.to_scaled_axis(), confidence))
     };
     let rotation = fill(own.rotation.iter().map(turn).collect(), &influence);
+    let is_moved = |index: usize| !is_fixed[index] && translation[index].is_some();
     let kept = |estimates: &[Estimate], index: usize| match estimates[index] {
-        Some((value, _)) if !is_fixed[index] => value,
+        Some((value, _)) if is_moved(index) => value,
         _ => DVec3::ZERO,
     };
     let count = gaussians.len();

@@ -88,8 +88,7 @@ fn moments_and_affine_fits_follow_the_goldens() {
             // Exact tracks: claim so little noise that the ridge vanishes.
             let exact = TrackField { sigma: vec![1e-4; 64 * 48], ..tracks.clone() };
             let mean = camera.project_world(gaussians.mean(i)).unwrap();
-            let size = DVec2::new(64.0, 48.0);
-            let Some(fit) = fit2d::fit(&moments(blend, &exact), mean, size, &settings()) else { continue };
+            let Some(fit) = fit2d::fit(&moments(blend, &exact), mean, &settings()) else { continue };
             let a =
                 DMat2::from_cols(DVec2::new(gradient[0], gradient[2]), DVec2::new(gradient[1], gradient[3]));
             let target = a * mean + DVec2::new(shift[0], shift[1]);

@@ -7,6 +7,7 @@ mod extremes;
 mod moments;
 mod orders;
 mod parts;
+mod rest;
 mod scenes;
 
 use std::sync::Arc;

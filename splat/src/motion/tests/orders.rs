@@ -66,7 +66,7 @@ fn tracks(mean: DVec2, shift: DVec2, strain: DMat2, noise: f64, random: &mut Cha
 fn fit(blend: &Blend, tracks: &TrackField, mean: DVec2) -> Fit {
     // Errors of these tracks are independent.
     let settings = MotionSettings { noise_correlation_area: 1.0, ..settings() };
-    fit2d::fit(&moments(blend, tracks), mean, DVec2::splat(SIDE as f64), &settings).unwrap()
+    fit2d::fit(&moments(blend, tracks), mean, &settings).unwrap()
 }
 
 /// A motion of an order: strains of 0.02 to 0.5, displacements of 0.5 to 10 px.
@@ -137,11 +137,10 @@ fn clear_motions_get_their_order_and_their_parameters() {
         assert_eq!(found.order, order);
         // Four standard deviations of the worst entry.
         let deviation =
-            4.0 * found.gradient_covariance.x_axis.x.max(found.gradient_covariance.y_axis.y).sqrt();
+            4.0 * found.affine_covariance.x_axis.x.max(found.affine_covariance.y_axis.y).sqrt();
         let error = found.gradient - DMat2::IDENTITY - strain;
         assert!(error.x_axis.abs().max(error.y_axis.abs()).max_element() < deviation, "{order:?}: {error}");
-        assert!((found.displacement - shift).length() < 4.0 * found.variance.sqrt(), "{order:?}");
-        assert!((found.residual - 0.1).abs() < 0.02, "{order:?}: residual {}", found.residual);
+        assert!((found.target - mean - shift).length() < 4.0 * found.variance.sqrt(), "{order:?}");
     }
 }
 
@@ -168,7 +167,7 @@ proptest! {
         prop_assume!(moments(&blend, &exact).pixels >= 4);
         let found = fit(&blend, &exact, mean);
         // Single precision of a track, 1.5e-5 px; over a footprint of at least half a pixel.
-        prop_assert!((found.displacement - shift).length() < 1e-3, "{} {shift}", found.displacement);
+        prop_assert!((found.target - mean - shift).length() < 1e-3, "{} {shift}", found.target);
         let error = found.gradient - DMat2::IDENTITY - strain;
         prop_assert!(error.x_axis.abs().max(error.y_axis.abs()).max_element() < 2e-3, "{error}");
     }
@@ -189,7 +188,7 @@ proptest! {
             wild.positions[pixel / 2][0] += 500.0;
         }
         let settings = settings();
-        if let Some(found) = fit2d::fit(&moments(&blend, &wild), mean, DVec2::splat(SIDE as f64), &settings) {
+        if let Some(found) = fit2d::fit(&moments(&blend, &wild), mean, &settings) {
             prop_assert!(found.variance > 0.0 && found.variance.is_finite());
             prop_assert!(found.target.is_finite() && found.gradient.is_finite());
         }

@@ -36,11 +36,10 @@ fn affine_field_gives_back_its_affine_map() {
     let shift = DVec2::new(7.5, -3.25);
     let (gaussians, camera) = (corner(60, 1), &cameras(1)[0]);
     let tracks = affine_tracks(camera, gradient, shift, 1e-4);
-    let size = DVec2::new(96.0, 64.0);
     let mut fitted = 0;
     for (i, blend) in weights(&gaussians, camera).iter().enumerate() {
         let mean = camera.project_world(gaussians.mean(i)).unwrap();
-        let Some(fit) = fit2d::fit(&moments(blend, &tracks), mean, size, &settings()) else { continue };
+        let Some(fit) = fit2d::fit(&moments(blend, &tracks), mean, &settings()) else { continue };
         fitted += 1;
         let target = gradient * mean + shift;
         // Tracks are stored in single precision, 4e-6 px at this size.
@@ -55,13 +54,12 @@ fn affine_field_gives_back_its_affine_map() {
 fn noisy_small_footprints_are_fitted_as_translations() {
     let (mut gaussians, camera) = (corner(30, 2), &cameras(1)[0]);
     gaussians.log_scales.fill([-9.0; 3]); // a tenth of a millipixel: only the low-pass filter remains
-    let size = DVec2::new(96.0, 64.0);
     let still = Rigid { shift: DVec3::new(0.1, 0.0, 0.05), ..Rigid::REST };
     let mut noisy = views(std::slice::from_ref(camera), |x| still.of(x), 1.0);
     scenes::add_noise(&mut noisy, 1.0, 9);
     for (i, blend) in weights(&gaussians, camera).iter().enumerate() {
         let mean = camera.project_world(gaussians.mean(i)).unwrap();
-        let Some(fit) = fit2d::fit(&moments(blend, &noisy[0].tracks), mean, size, &settings()) else {
+        let Some(fit) = fit2d::fit(&moments(blend, &noisy[0].tracks), mean, &settings()) else {
             continue;
         };
         let strain = fit.gradient - DMat2::IDENTITY;
@@ -162,7 +160,7 @@ fn flat_gaussian_alone_turns_by_its_footprints() {
             let tracks = scenes::tracks(camera, |x| truth.of(x), 0.01);
             let fit = |(i, blend): (usize, &Blend)| {
                 let mean = camera.project_world(gaussians.mean(i)).unwrap();
-                fit2d::fit(&moments(blend, &tracks), mean, DVec2::new(96.0, 64.0), &settings())
+                fit2d::fit(&moments(blend, &tracks), mean, &settings())
             };
             weights(&gaussians, camera).iter().enumerate().map(fit).collect()
         })

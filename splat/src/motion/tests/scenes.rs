@@ -79,7 +79,7 @@ pub(super) fn corner(count: usize, seed: u64) -> Gaussians {
 }
 
 /// The point of the corner's nearest wall on the ray through a pixel centre.
-fn surface(camera: &Camera, column: u32, row: u32) -> Option<DVec3> {
+pub(super) fn surface(camera: &Camera, column: u32, row: u32) -> Option<DVec3> {
     let slope = DVec3::new(
         (f64::from(column) + 0.5 - camera.cx) / camera.fx,
         (f64::from(row) + 0.5 - camera.cy) / camera.fy,
