@@ -205,13 +205,23 @@ fn solve_alone(
             doubt: o.fit.doubt,
         })
         .collect();
-    if let Some(voters) = static_test::voters_for_rest(observations, settings) {
+    let resting = |voters: Vec<usize>| {
         let own = lift::at_rest(&sightings, voters, mean, settings);
         let is_determined = own.as_ref().is_some_and(|own| own.is_determined);
         let origin = if is_determined { MotionOrigin::Static } else { MotionOrigin::Unsolved };
-        return State { is_seen_at_rest: true, ..State::unmoved(origin, own) };
-    }
-    let Some(lift) = lift::solve(&sightings, mean, settings) else {
+        State { is_seen_at_rest: true, ..State::unmoved(origin, own) }
+    };
+    let lift = || lift::solve(&sightings, mean, settings);
+    let voters = static_test::voters_for_rest(observations, settings);
+    let lift = match voters {
+        None => lift(),
+        Some(voters) if voters.len() == observations.len() => return resting(voters),
+        Some(voters) => match lift().filter(|lift| static_test::refutes(lift, voters.len(), settings)) {
+            None => return resting(voters),
+            moved => moved,
+        },
+    };
+    let Some(lift) = lift else {
         return State::unmoved(MotionOrigin::Unsolved, None);
     };
     if !lift.is_determined {
@@ -250,11 +260,12 @@ fn turn_solved(
             let spacing = context.neighbourhood.spacing;
             let motion =
                 rotation::fit_rigid_motion(&members, &axes, own.translation, spacing, context.settings);
-            Some((index, motion.rotation))
+            Some((index, motion))
         })
         .collect();
-    for (index, rotation) in rotations {
-        states[index].rotation = rotation;
+    for (index, motion) in rotations {
+        states[index].rotation = motion.rotation;
+        states[index].rotation_error = motion.rotation_error;
     }
 }
 
@@ -268,7 +279,10 @@ fn field(
         translation: states.iter().map(|state| state.translation).collect(),
         rotation: states.iter().map(|state| state.rotation).collect(),
         origin: states.iter().map(|state| state.origin).collect(),
-        information: states.iter().map(|s| s.own.as_ref().map_or(DMat3::ZERO, |own| own.information)).collect(),
+        information: states
+            .iter()
+            .map(|s| s.own.as_ref().map_or(DMat3::ZERO, |own| own.information))
+            .collect(),
         turns_harmonics: true,
         log_scale: strain::log_strains(states, observations, views, context),
         orders: OrderCounts::of(observations.iter().flatten().map(|observation| observation.fit.order)),

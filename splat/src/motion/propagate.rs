@@ -18,6 +18,8 @@ pub(super) struct State {
     pub origin: MotionOrigin,
     pub translation: DVec3,
     pub rotation: DQuat,
+    /// Mean square error of the rotation vector, radians².
+    pub rotation_error: DMat3,
     /// What its own footprints say: of a solved Gaussian everything, of another the directions that were
     /// seen.
     pub own: Option<Lift>,
@@ -28,7 +30,14 @@ pub(super) struct State {
 impl State {
     /// Neither moved nor turned.
     pub(super) fn unmoved(origin: MotionOrigin, own: Option<Lift>) -> Self {
-        Self { origin, translation: DVec3::ZERO, rotation: DQuat::IDENTITY, own, is_seen_at_rest: false }
+        Self {
+            origin,
+            translation: DVec3::ZERO,
+            rotation: DQuat::IDENTITY,
+            rotation_error: DMat3::ZERO,
+            own,
+            is_seen_at_rest: false,
+        }
     }
 
     fn is_known(&self) -> bool {
@@ -217,7 +226,7 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
             context.member(index, n.index, n.affinity, state, information)
         })
         .collect();
-    let RigidMotion { mut translation, rotation } = fit_rigid_motion(
+    let RigidMotion { mut translation, rotation, rotation_error } = fit_rigid_motion(
         &members,
         &[],
         consensus.translation,
@@ -232,7 +241,8 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
     }
     translation += pull.unwrap_or(DVec3::ZERO);
     let own = own.clone().filter(|_| pull.is_some());
-    Some(State { origin: MotionOrigin::Propagated, translation, rotation, own, is_seen_at_rest: false })
+    let origin = MotionOrigin::Propagated;
+    Some(State { origin, translation, rotation, rotation_error, own, is_seen_at_rest: false })
 }
 
 /// How far what a Gaussian's own views see moves it from its neighbours' prediction, whose standard deviation is

@@ -56,14 +56,16 @@ pub(super) struct RigidMotion {
     pub translation: DVec3,
     /// The identity unless significant.
     pub rotation: DQuat,
+    /// Mean square error of the rotation vector, radians²: its covariance and what shrinking it left out.
+    pub rotation_error: DMat3,
 }
 
 /// Fits `d_j ≈ t + (R − I) x_j` to the members and `y_k ≈ R q_k` to the axes, each by its information.
 ///
 /// Both sources meet in one least-squares problem on SE(3), so that each direction of rotation comes from
 /// whichever knows it better. Members that do not move with the rest are shed by redescending weights on
-/// their strain. The rotation is shrunk by its significance (positive-part James-Stein), where its deviation
-/// grows with the misfit: noise alone turns nothing. `start` is the translation from which members are judged
+/// their strain. The rotation is shrunk by its significance, where its deviation grows with the misfit: noise alone turns
+/// nothing. `start` is the translation from which members are judged
 /// first.
 pub(super) fn fit_rigid_motion(
     members: &[Member],
@@ -72,7 +74,8 @@ pub(super) fn fit_rigid_motion(
     spacing: f64,
     settings: &MotionSettings,
 ) -> RigidMotion {
-    let unturned = RigidMotion { translation: start, rotation: DQuat::IDENTITY };
+    let prior = DMat3::from_diagonal(DVec3::splat(settings.expected_rotation.powi(2)));
+    let unturned = RigidMotion { translation: start, rotation: DQuat::IDENTITY, rotation_error: prior };
     let mut motion = unturned;
     let mut stage = 0;
     let mut system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
@@ -102,10 +105,20 @@ pub(super) fn fit_rigid_motion(
         }
     }
     let turn = motion.rotation.to_scaled_axis();
-    let chi_squared = system.rotation_information().map_or(0.0, |information| turn.dot(information * turn));
-    let kept = 1.0 - settings.rotation_significance.powi(2) / chi_squared.max(f64::MIN_POSITIVE);
+    let information = system.rotation_information().unwrap_or_default();
+    let kept = significant_share(turn.dot(information * turn), settings.rotation_significance);
     let rotation = if kept > 0.0 { DQuat::from_scaled_axis(turn * kept) } else { DQuat::IDENTITY };
-    RigidMotion { rotation, ..motion }
+    let left_out = turn * (1.0 - kept);
+    let stiffness = information + DMat3::from_diagonal(DVec3::splat(system.prior));
+    let covariance = if stiffness.is_finite() { stiffness.inverse() } else { prior };
+    RigidMotion { rotation, rotation_error: covariance + outer(left_out, left_out), ..motion }
+}
+
+/// What to keep of an estimate of this squared significance: nothing of an insignificant one, soon everything of one
+/// beyond it.
+pub(super) fn significant_share(chi_squared: f64, significance: f64) -> f64 {
+    let excess = significance.powi(2) / chi_squared.max(f64::MIN_POSITIVE);
+    (1.0 - excess * excess).max(0.0)
 }
 
 /// The rotation that takes two axes to where they are seen, each bent as much as the other to keep their angle.

@@ -1,6 +1,6 @@
 //! Whether a Gaussian moves at all.
 
-use super::{MotionSettings, observe::Observation, order::Order};
+use super::{MotionSettings, lift::Lift, observe::Observation, order::Order};
 
 /// The observations that find a Gaussian at rest, by their index, if they have most of the weight.
 ///
@@ -20,4 +20,14 @@ pub(super) fn voters_for_rest(observations: &[Observation], settings: &MotionSet
         all += sharpness * transmittance;
     }
     (all > 0.0 && at_rest > settings.static_share * all).then_some(voters)
+}
+
+/// Whether a solved position explains more views than rest, by a motion beyond doubt: what moves along the rays of most
+/// views moves for the others.
+pub(super) fn refutes(lift: &Lift, voters: usize, settings: &MotionSettings) -> bool {
+    let chi_squared = lift.translation.dot(lift.information * lift.translation);
+    // Three components instead of the two of a displacement, of a Gaussian that most views see at rest: noise alone exceeds
+    // twice the square of 3 in 0.04 % of them.
+    let is_significant = chi_squared > 2.0 * settings.static_significance.powi(2);
+    lift.is_determined && lift.inliers.len() > voters && is_significant
 }

@@ -7,6 +7,7 @@ use super::{
     MotionOrigin, MotionSettings, MotionView,
     observe::Observation,
     propagate::{Context, State},
+    rotation::significant_share,
 };
 use crate::cameras::Camera;
 
@@ -20,8 +21,7 @@ const LEAST_ERROR: f64 = 0.01;
 ///
 /// An axis `q` whose line turns to `R q` is seen as `A T q ≈ λ T' R q`, with the Jacobian `T` at the old and `T'` at the
 /// new mean: one unknown `λ` per axis, which no ill-determined direction enters. The thinnest axis takes no part: it
-/// lies out of the surface that the tracks show. What exceeds the significance counts by the share of its square that
-/// does (positive-part James-Stein).
+/// lies out of the surface that the tracks show.
 pub(super) fn log_strains(
     states: &[State],
     observations: &[Vec<Observation>],
@@ -43,7 +43,13 @@ pub(super) fn log_strains(
         let mut strains = DVec3::ZERO;
         for k in (0..3).filter(|&k| k != thinnest) {
             let axis = axes.col(k);
-            let line = Line { axis, turned: state.rotation * axis, mean, moved: mean + state.translation };
+            let line = Line {
+                axis,
+                turned: state.rotation * axis,
+                turn_error: state.rotation_error,
+                mean,
+                moved: mean + state.translation,
+            };
             let off_surface = OFF_SURFACE * (log_scales[thinnest] - log_scales[k]).exp();
             strains[k] = line
                 .log_stretch(&seen, views)
@@ -56,7 +62,7 @@ pub(super) fn log_strains(
 
 fn significant(strain: f64, variance: f64, off_surface: f64, settings: &MotionSettings) -> f64 {
     let total = variance + off_surface.powi(2) + LEAST_ERROR.powi(2);
-    let kept = 1.0 - settings.scale_significance.powi(2) * total / (strain * strain);
+    let kept = significant_share(strain * strain / total, settings.scale_significance);
     let bound = settings.max_log_strain;
     if kept > 0.0 { (strain * kept).clamp(-bound, bound) } else { 0.0 }
 }
@@ -67,39 +73,50 @@ struct Line {
     axis: DVec3,
     /// Unit direction after it.
     turned: DVec3,
+    /// Mean square error of the rotation vector between them.
+    turn_error: DMat3,
     mean: DVec3,
     moved: DVec3,
 }
 
 impl Line {
-    /// Logarithm of the stretch and its variance, which grows with the misfit between views.
+    /// Logarithm of the stretch and its variance, which grows with the misfit between views, and with how much an error of
+    /// the rotation would look like a stretch.
     fn log_stretch(&self, seen: &[&Observation], views: &[MotionView]) -> Option<(f64, f64)> {
-        let in_view = |camera: &Camera, at: DVec3, direction: DVec3| {
-            let [u, v] = camera.world_jacobian(camera.to_camera(at));
-            DVec2::new(u.dot(direction), v.dot(direction))
-        };
-        let lines: Vec<(DVec2, DVec2, f64)> = seen
-            .iter()
-            .filter_map(|Observation { view, fit, .. }| {
-                let camera = &views[*view].camera;
-                let before = in_view(camera, self.mean, self.axis);
-                let expected = in_view(camera, self.moved, self.turned);
-                let variance = before.dot(fit.affine_covariance * before);
-                (variance > 0.0).then(|| (expected, fit.affine * before, variance))
-            })
-            .collect();
-        let (mut information, mut right) = (0.0, 0.0);
-        for (expected, found, variance) in &lines {
+        let sights: Vec<Sight> = seen.iter().filter_map(|o| self.sight(o, &views[o.view].camera)).collect();
+        let (mut information, mut right, mut by_turn) = (0.0, 0.0, DVec3::ZERO);
+        for Sight { expected, found, variance, by_turn: change } in &sights {
             information += expected.length_squared() / variance;
             right += expected.dot(*found) / variance;
+            by_turn += *change / *variance;
         }
         let stretch = right / information;
-        let chi_squared: f64 = lines
-            .iter()
-            .map(|(expected, found, variance)| (*found - *expected * stretch).length_squared() / variance)
-            .sum();
-        let misfit = (chi_squared / (2.0 * lines.len() as f64 - 1.0)).max(1.0);
-        let variance = misfit / (information * stretch * stretch);
+        let chi_squared: f64 =
+            sights.iter().map(|s| (s.found - s.expected * stretch).length_squared() / s.variance).sum();
+        let misfit = (chi_squared / (2.0 * sights.len() as f64 - 1.0)).max(1.0);
+        let by_turn = by_turn / information;
+        let variance = misfit / (information * stretch * stretch) + by_turn.dot(self.turn_error * by_turn);
         (stretch > 0.0 && variance.is_finite()).then(|| (stretch.ln(), variance))
     }
+
+    fn sight(&self, Observation { fit, .. }: &Observation, camera: &Camera) -> Option<Sight> {
+        let in_view = |[u, v]: [DVec3; 2], direction: DVec3| DVec2::new(u.dot(direction), v.dot(direction));
+        let [u, v] = camera.world_jacobian(camera.to_camera(self.moved));
+        let before = in_view(camera.world_jacobian(camera.to_camera(self.mean)), self.axis);
+        let expected = in_view([u, v], self.turned);
+        let variance = before.dot(fit.affine_covariance * before);
+        let by_turn = self.turned.cross(u * expected.x + v * expected.y);
+        (variance > 0.0).then(|| Sight { expected, found: fit.affine * before, variance, by_turn })
+    }
+}
+
+/// An axis after the motion, in one view; pixels per world unit.
+struct Sight {
+    /// Unstretched.
+    expected: DVec2,
+    found: DVec2,
+    /// Per component of `found`.
+    variance: f64,
+    /// Derivative of half of `|expected|²` by the rotation vector.
+    by_turn: DVec3,
 }

@@ -136,8 +136,7 @@ fn clear_motions_get_their_order_and_their_parameters() {
         let found = fit(&blend, &tracks(mean, shift, strain, 0.1, &mut random), mean);
         assert_eq!(found.order, order);
         // Four standard deviations of the worst entry.
-        let deviation =
-            4.0 * found.affine_covariance.x_axis.x.max(found.affine_covariance.y_axis.y).sqrt();
+        let deviation = 4.0 * found.affine_covariance.x_axis.x.max(found.affine_covariance.y_axis.y).sqrt();
         let error = found.gradient - DMat2::IDENTITY - strain;
         assert!(error.x_axis.abs().max(error.y_axis.abs()).max_element() < deviation, "{order:?}: {error}");
         assert!((found.target - mean - shift).length() < 4.0 * found.variance.sqrt(), "{order:?}");
