@@ -55,7 +55,7 @@ use lift::Sighting;
 use neighbours::Neighbourhood;
 use observe::Observation;
 use propagate::{Context, State};
-use rotation::{Deformation, Member};
+use rotation::{Deformation, Expectation, Member};
 use value_order::ValueOrder;
 
 /// How a Gaussian's motion was found.
@@ -258,8 +258,8 @@ fn turn_solved(
                 .collect();
             let axes = rotation::lift_axes(context.gaussians, index, own.translation, &deformations);
             let spacing = context.neighbourhood.spacing;
-            let motion =
-                rotation::fit_rigid_motion(&members, &axes, own.translation, spacing, context.settings);
+            let expectation = Expectation::unturned(own.translation, context.settings);
+            let motion = rotation::fit_rigid_motion(&members, &axes, &expectation, spacing, context.settings);
             Some((index, motion))
         })
         .collect();

@@ -8,7 +8,7 @@ use super::{
     lift::Lift,
     linear::solve,
     neighbours::{Neighbour, Neighbourhood},
-    rotation::{Member, RigidMotion, fit_rigid_motion},
+    rotation::{Expectation, Member, RigidMotion, fit_rigid_motion},
 };
 use crate::gaussians::Gaussians;
 
@@ -79,6 +79,21 @@ impl Context<'_> {
             information,
             affinity,
         }
+    }
+
+    /// Followers turn as those whom they follow do on average, give or take the strain of a neighbourhood, unless the
+    /// displacements say otherwise: of few neighbours, or of those in a line, these do not determine a rotation.
+    fn expectation(&self, consensus: &Consensus, states: &[State]) -> Expectation {
+        let mut mean = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0);
+        for member in &consensus.members {
+            let turn = states[member.index].rotation;
+            // `q` and `-q` are the same rotation.
+            let side = if mean.dot(turn) < 0.0 { -1.0 } else { 1.0 };
+            mean = mean + turn * (side * member.affinity);
+        }
+        let rotation = if mean.length_squared() > 0.0 { mean.normalize() } else { DQuat::IDENTITY };
+        let deviation = self.settings.neighbour_strain;
+        Expectation { translation: consensus.translation, rotation, deviation }
     }
 
     /// The neighbours of known motion that move most alike, and the motion in their middle.
@@ -229,7 +244,7 @@ fn follow_neighbours(index: usize, states: &[State], context: &Context<'_>) -> O
     let RigidMotion { mut translation, rotation, rotation_error } = fit_rigid_motion(
         &members,
         &[],
-        consensus.translation,
+        &context.expectation(&consensus, states),
         context.neighbourhood.spacing,
         context.settings,
     );

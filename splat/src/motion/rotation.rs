@@ -49,12 +49,41 @@ pub(super) struct TurnedAxis {
     pub information: DMat3,
 }
 
+/// What is expected of a rigid motion before anything is measured.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Expectation {
+    /// Displacement of the centre, from which members are judged first.
+    pub translation: DVec3,
+    pub rotation: DQuat,
+    /// Standard deviation of the rotation, radians.
+    pub deviation: f64,
+}
+
+impl Expectation {
+    /// No rotation, give or take the expected one.
+    pub(super) fn unturned(translation: DVec3, settings: &MotionSettings) -> Self {
+        Self { translation, rotation: DQuat::IDENTITY, deviation: settings.expected_rotation }
+    }
+
+    /// Of both components.
+    fn precision(&self) -> f64 {
+        self.deviation.powi(2).max(f64::MIN_POSITIVE).recip()
+    }
+
+    /// Rotation vector from the expected rotation.
+    fn departure(&self, rotation: DQuat) -> DVec3 {
+        let departure = rotation * self.rotation.inverse();
+        // The shorter way round: `q` and `-q` are the same rotation.
+        if departure.w < 0.0 { -departure } else { departure }.to_scaled_axis()
+    }
+}
+
 /// A rigid motion of a neighbourhood about its centre.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct RigidMotion {
     /// Displacement of the centre.
     pub translation: DVec3,
-    /// The identity unless significant.
+    /// The expected one unless what is measured differs significantly.
     pub rotation: DQuat,
     /// Mean square error of the rotation vector, radians²: its covariance and what shrinking it left out.
     pub rotation_error: DMat3,
@@ -64,25 +93,27 @@ pub(super) struct RigidMotion {
 ///
 /// Both sources meet in one least-squares problem on SE(3), so that each direction of rotation comes from
 /// whichever knows it better. Members that do not move with the rest are shed by redescending weights on
-/// their strain. The rotation is shrunk by its significance, where its deviation grows with the misfit: noise alone turns
-/// nothing. `start` is the translation from which members are judged
-/// first.
+/// their strain. What the rotation differs from the expected one is shrunk by its significance, where its deviation grows
+/// with the misfit: noise alone turns nothing.
 pub(super) fn fit_rigid_motion(
     members: &[Member],
     axes: &[TurnedAxis],
-    start: DVec3,
+    expectation: &Expectation,
     spacing: f64,
     settings: &MotionSettings,
 ) -> RigidMotion {
-    let prior = DMat3::from_diagonal(DVec3::splat(settings.expected_rotation.powi(2)));
-    let unturned = RigidMotion { translation: start, rotation: DQuat::IDENTITY, rotation_error: prior };
-    let mut motion = unturned;
+    let unmeasured = RigidMotion {
+        translation: expectation.translation,
+        rotation: expectation.rotation,
+        rotation_error: DMat3::from_diagonal(DVec3::splat(expectation.deviation.powi(2))),
+    };
+    let mut motion = unmeasured;
     let mut stage = 0;
-    let mut system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
+    let mut system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, expectation);
     if let Some(rotation) = turn_of_axes(axes) {
-        let turned = RigidMotion { rotation, ..unturned };
-        let from_there = System::new(members, axes, &turned, BODY_STRAIN[stage], spacing, settings);
-        if from_there.cost(&turned) < system.cost(&unturned) {
+        let turned = RigidMotion { rotation, ..unmeasured };
+        let from_there = System::new(members, axes, &turned, BODY_STRAIN[stage], spacing, expectation);
+        if from_there.cost(&turned, expectation) < system.cost(&unmeasured, expectation) {
             (motion, system) = (turned, from_there);
         }
     }
@@ -90,7 +121,7 @@ pub(super) fn fit_rigid_motion(
         let (translation, turn) = system.solve();
         let turn = turn.clamp_length_max(LONGEST_STEP);
         if !(translation.is_finite() && turn.is_finite()) {
-            return unturned;
+            return unmeasured;
         }
         motion.translation += translation;
         motion.rotation = (DQuat::from_scaled_axis(turn) * motion.rotation).normalize();
@@ -99,19 +130,26 @@ pub(super) fn fit_rigid_motion(
         if turn.length() < SETTLED && !is_last_stage {
             stage += 1;
         }
-        system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, settings);
+        system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, expectation);
         if is_last_stage && has_converged {
             break;
         }
     }
-    let turn = motion.rotation.to_scaled_axis();
+    let turn = expectation.departure(motion.rotation);
     let information = system.rotation_information().unwrap_or_default();
     let kept = significant_share(turn.dot(information * turn), settings.rotation_significance);
-    let rotation = if kept > 0.0 { DQuat::from_scaled_axis(turn * kept) } else { DQuat::IDENTITY };
     let left_out = turn * (1.0 - kept);
-    let stiffness = information + DMat3::from_diagonal(DVec3::splat(system.prior));
-    let covariance = if stiffness.is_finite() { stiffness.inverse() } else { prior };
-    RigidMotion { rotation, rotation_error: covariance + outer(left_out, left_out), ..motion }
+    if left_out != DVec3::ZERO {
+        motion.rotation = DQuat::from_scaled_axis(turn * kept) * expectation.rotation;
+    }
+    motion.rotation_error = system.rotation_covariance() + outer(left_out, left_out);
+    // The translation that goes with the rotation that is left.
+    let system = System::new(members, axes, &motion, BODY_STRAIN[stage], spacing, expectation);
+    let translation = system.translation_covariance() * system.force;
+    if translation.is_finite() {
+        motion.translation += translation;
+    }
+    motion
 }
 
 /// What to keep of an estimate of this squared significance: nothing of an insignificant one, soon everything of one
@@ -159,11 +197,11 @@ impl System {
         motion: &RigidMotion,
         body_strain: f64,
         spacing: f64,
-        settings: &MotionSettings,
+        expectation: &Expectation,
     ) -> Self {
         let turn = DMat3::from_quat(motion.rotation);
-        let prior = settings.expected_rotation.powi(2).max(f64::MIN_POSITIVE).recip();
-        let torque = motion.rotation.to_scaled_axis() * -prior;
+        let prior = expectation.precision();
+        let torque = expectation.departure(motion.rotation) * -prior;
         let mut system = Self { prior, torque, freedom: -6.0, ..Self::default() };
         for member in members {
             let lever = turn * member.offset;
@@ -201,8 +239,8 @@ impl System {
     }
 
     /// What `motion`, at which this was set up, costs.
-    fn cost(&self, motion: &RigidMotion) -> f64 {
-        self.chi_squared + self.prior * motion.rotation.to_scaled_axis().length_squared()
+    fn cost(&self, motion: &RigidMotion, expectation: &Expectation) -> f64 {
+        self.chi_squared + self.prior * expectation.departure(motion.rotation).length_squared()
     }
 
     /// Inverse of the translation block; a tiny share of its trace stands in where no member sees a
@@ -227,6 +265,17 @@ impl System {
         let stiffness = self.free_rotation() + DMat3::from_diagonal(DVec3::splat(self.prior));
         let turn = stiffness.inverse() * torque;
         (covariance * (self.force - self.coupling * turn), turn)
+    }
+
+    /// Covariance of the rotation vector by what was claimed: strain of the neighbourhood makes a misfit, but no error of
+    /// the rotation.
+    fn rotation_covariance(&self) -> DMat3 {
+        let covariance = (self.free_rotation() + DMat3::from_diagonal(DVec3::splat(self.prior))).inverse();
+        if covariance.is_finite() {
+            covariance
+        } else {
+            DMat3::from_diagonal(DVec3::splat(self.prior.recip()))
+        }
     }
 
     /// Inverse covariance of the rotation vector, divided by the misfit.

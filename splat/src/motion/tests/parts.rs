@@ -5,7 +5,7 @@ use glam::{DMat2, DMat3, DVec2};
 use super::{
     super::{
         fit2d, lift,
-        rotation::{Deformation, Member, fit_rigid_motion, lift_axes},
+        rotation::{Deformation, Expectation, Member, fit_rigid_motion, lift_axes},
     },
     dense::{Blend, moments, weights},
     *,
@@ -144,7 +144,8 @@ fn neighbours_and_axes_find_large_rotations() {
                 affinity: 1.0,
             }])
             .collect();
-        let motion = fit_rigid_motion(&members, &[], DVec3::X, 0.1, &settings());
+        let motion =
+            fit_rigid_motion(&members, &[], &Expectation::unturned(DVec3::X, &settings()), 0.1, &settings());
         let error = motion.rotation.angle_between(truth).to_degrees();
         assert!(error < 0.05, "{degrees}°: {error}°");
         assert!((motion.translation - DVec3::X).length() < 1e-4);
@@ -175,7 +176,8 @@ fn flat_gaussian_alone_turns_by_its_footprints() {
         let translation = truth.of(gaussians.mean(i)) - gaussians.mean(i);
         let axes = lift_axes(&gaussians, i, translation, &seen);
         assert_eq!(axes.len(), 2);
-        let motion = fit_rigid_motion(&[], &axes, translation, 0.1, &settings());
+        let motion =
+            fit_rigid_motion(&[], &axes, &Expectation::unturned(translation, &settings()), 0.1, &settings());
         errors.push(motion.rotation.angle_between(truth.turn).to_degrees());
     }
     errors.sort_by(f64::total_cmp);
