@@ -43,6 +43,12 @@ const LED: Bar = Bar {
           least, its turn unknown to its true size; the bodies do not strain",
 };
 
+/// The same where so few are known that their displacements alone do not show how they turn.
+const LED_BY_FEW: Bar = Bar {
+    why: "the same, and the expected strain of 0.1 × the mean distance of those that are known: their turns are not passed on",
+    ..LED
+};
+
 /// What was found of the Gaussians of an extreme, by the origin of their motion.
 #[derive(Clone, Debug)]
 pub(super) struct Verdict {
@@ -56,6 +62,8 @@ pub(super) struct Verdict {
     strained: usize,
     /// Share of the Gaussians whose scale may change although the motion is rigid.
     may_strain: f64,
+    /// Departure of a follower from the rigid motion of those it follows, as a share of their distance.
+    may_depart: f64,
 }
 
 impl Verdict {
@@ -67,6 +75,7 @@ impl Verdict {
             origins: Origins::default(),
             strained: 0,
             may_strain: 0.0,
+            may_depart: 0.0,
         }
     }
 
@@ -94,6 +103,8 @@ impl Verdict {
         self.origins.add(other.origins);
         self.strained += other.strained;
         self.may_strain = self.may_strain.max(other.may_strain);
+        self.may_depart = self.may_depart.max(other.may_depart);
+        self.led.bar = other.led.bar;
         self
     }
 
@@ -101,6 +112,12 @@ impl Verdict {
     pub(super) fn straining(mut self, share: f64) -> Self {
         self.may_strain = self.may_strain.max(share);
         self
+    }
+
+    /// To be filled by so few known motions that followers may depart by the expected strain.
+    pub(super) fn expect_few(&mut self) {
+        self.may_depart = MotionSettings::default().neighbour_strain;
+        self.led.bar = LED_BY_FEW;
     }
 
     fn row(mut self) -> Row {
@@ -131,7 +148,9 @@ pub(super) fn table(verdicts: Vec<Verdict>) -> Vec<Row> {
     let mut rows = Vec::new();
     for verdict in verdicts {
         at_rest.absorb(&verdict.at_rest);
-        led.absorb(&verdict.led);
+        if verdict.may_depart == 0.0 {
+            led.absorb(&verdict.led);
+        }
         rows.push(verdict.row());
     }
     rows.extend([at_rest, led].into_iter().filter(|row| row.cases > 0));
@@ -333,7 +352,8 @@ fn judge(
             row.case(0.0, 0.0);
         }
         (MotionOrigin::Propagated, _) if demand != Demand::Solved => {
-            let predicted = led_deviation(scene, field, index, settings).unwrap_or(0.0) + rounding;
+            let (deviation, distance) = led_deviation(scene, field, index, settings).unwrap_or_default();
+            let predicted = deviation.hypot(verdict.may_depart * distance) + rounding;
             if error > LED.factor * predicted {
                 println!("{}: {error} behind its neighbours, predicted {predicted}", row.extreme);
             }

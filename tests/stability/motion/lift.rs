@@ -179,6 +179,28 @@ fn displacement(pixels: f64) -> impl Fn(&mut Scene) + Sync {
     }
 }
 
+/// Bodies of which every so many-th Gaussian is seen, all others being transparent, and the noise of their tracks.
+const UNSEEN: [(&str, usize, f64); 4] = [
+    ("every other Gaussian unseen", 2, 0.0),
+    ("every other Gaussian unseen, noise 1 px", 2, 1.0),
+    ("four of five Gaussians unseen", 5, 0.0),
+    ("four of five Gaussians unseen, noise 1 px", 5, 1.0),
+];
+
+fn followers((extreme, seen, noise): (&'static str, usize, f64)) -> Verdict {
+    Verdict::of_seeds("motion: field", extreme, FIELD, 8, |verdict, seed| {
+        if seen > 2 {
+            verdict.expect_few();
+        }
+        let mut scene = body(Rig::USUAL, 25, seed);
+        scene.noise = Noise::Independent(noise);
+        for (index, opacity) in scene.gaussians.logit_opacities.iter_mut().enumerate() {
+            *opacity = if index % seen == 0 { *opacity } else { -1e30 };
+        }
+        together(verdict, &scene);
+    })
+}
+
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
     let twelve = Rig { views: 12, ..Rig::USUAL };
@@ -206,5 +228,8 @@ pub(crate) fn rows() -> Vec<Row> {
             (scene.outliers, scene.noise) = (share, Noise::Independent(0.3));
         }));
     }
-    table(rows)
+    let followers = UNSEEN.map(followers);
+    let led = followers.clone().map(|verdict| verdict.led);
+    rows.extend(followers);
+    [table(rows), led.into()].concat()
 }

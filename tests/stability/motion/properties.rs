@@ -106,7 +106,7 @@ fn assert_recovered(judged: &[Judged], field: &MotionField) -> Result<(), TestCa
 
 /// The cameras that see a Gaussian of a wall well enough, others before it included: by the thresholds of the settings on
 /// blending weight, visible share, pixels, and transmittance relative to the best view's.
-fn seen_on_wall<'a>(wall: &'a Wall) -> Vec<Vec<&'a Camera>> {
+fn seen_on_wall(wall: &Wall) -> Vec<Vec<&Camera>> {
     let settings = MotionSettings::default();
     let moments: Vec<_> = wall.moments().into_iter().zip(&wall.cameras).collect();
     let unoccluded = |index: usize, camera: &Camera| unoccluded_weight(&wall.gaussians, index, camera);

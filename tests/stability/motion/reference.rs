@@ -199,13 +199,13 @@ pub(super) fn resting_deviation(sights: &[Sight<'_>], mean: DVec3, settings: &Mo
 
 /// Standard deviation of the position of Gaussian `index` by the rigid motion of the nearest ones of known motion, to first
 /// order: least squares of their displacements by the information that the shipped path may assume, with the turn free
-/// within its true size. `None` if no motion is known.
+/// within its true size; and the mean distance of those. `None` if no motion is known.
 pub(super) fn led_deviation(
     scene: &impl Tracked,
     field: &MotionField,
     index: usize,
     settings: &MotionSettings,
-) -> Option<f64> {
+) -> Option<(f64, f64)> {
     let (gaussians, motion) = (scene.gaussians(), scene.motion());
     let mean = gaussians.mean(index);
     let is_known =
@@ -217,6 +217,8 @@ pub(super) fn led_deviation(
     let size = gaussians.mean(*known.last()?).distance(mean).max(f64::MIN_POSITIVE);
     let unit = known.iter().find_map(|&other| position_covariance(scene, other, settings))?.trace();
     let mut normal = Matrix6::zeros();
+    let distance =
+        known.iter().map(|&other| gaussians.mean(other).distance(mean)).sum::<f64>() / known.len() as f64;
     for other in known {
         let Some(information) =
             position_covariance(scene, other, settings).and_then(|c| (c / unit).try_inverse())
@@ -234,7 +236,7 @@ pub(super) fn led_deviation(
         normal[(axis, axis)] += unit / (turn * turn);
     }
     let covariance = normal.try_inverse()?.fixed_view::<3, 3>(0, 0).trace() * unit;
-    covariance.is_finite().then(|| covariance.sqrt())
+    covariance.is_finite().then(|| (covariance.sqrt(), distance))
 }
 
 /// Covariance that the shipped path may assume of a position.
