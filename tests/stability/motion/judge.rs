@@ -45,7 +45,8 @@ const LED: Bar = Bar {
 
 /// The same where so few are known that their displacements alone do not show how they turn.
 const LED_BY_FEW: Bar = Bar {
-    why: "that of the row of every other Gaussian unseen, and the expected strain of 0.1 × the mean distance of the known: their turns are not passed on",
+    why: "that of the row of every other Gaussian unseen, and the expected strain of 0.1 × the mean distance of the known: their \
+          turns are not passed on",
     ..LED
 };
 
