@@ -26,8 +26,9 @@ mod session;
 mod storage;
 
 use motion::{
-    footprints as motion_footprints, lift as motion_lift, partial as motion_partial,
-    population as motion_population, poses, rotation as motion_rotation,
+    footprints as motion_footprints, lift as motion_lift, moments as motion_moments,
+    partial as motion_partial, population as motion_population, poses,
+    regularisation as motion_regularisation, rotation as motion_rotation,
 };
 
 /// A test for every sweep, and the list of them.
@@ -57,9 +58,11 @@ sweeps! {
     storage,
     metrics,
     poses,
+    motion_moments,
     motion_footprints,
     motion_lift,
     motion_partial,
+    motion_regularisation,
     motion_rotation,
     motion_population,
 }

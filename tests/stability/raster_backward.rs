@@ -123,6 +123,9 @@ fn rows_per_class() -> Vec<Row> {
 
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
-    let pile = pile("5000 Gaussians on one pixel, opacity 0.0039 to 1", 5000);
-    rows_per_class().into_iter().chain(extremes().iter().chain([&pile]).map(row)).collect()
+    let few = pile("5000 Gaussians on one pixel, opacity 0.0039 to 1", 5000, 5);
+    let mut many = pile("100 000 Gaussians on one pixel, opacity 0.0039", 100_000, 1);
+    // Nearly transparent, so that most have a gradient.
+    many.scenes.truncate(1);
+    rows_per_class().into_iter().chain(extremes().iter().chain([&few, &many]).map(row)).collect()
 }

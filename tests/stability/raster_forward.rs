@@ -59,7 +59,7 @@ fn row(extreme: &Extreme) -> Row {
 
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
-    let pile = pile("100 000 Gaussians on one pixel, opacity 0.0039 to 1", 100_000);
+    let pile = pile("100 000 Gaussians on one pixel, opacity 0.0039 to 1", 100_000, 5);
     let all = [typical()].into_iter().chain(extremes()).chain([pile]);
     all.map(|extreme| row(&extreme)).collect()
 }

@@ -79,6 +79,17 @@ impl Row {
         self.case(if is_right { 0.0 } else { 1.0 }, 0.0);
     }
 
+    /// Adds the cases of another row of the same bar.
+    pub(crate) fn absorb(&mut self, other: &Self) {
+        self.cases += other.cases;
+        if !(other.largest <= self.largest) {
+            self.largest = other.largest;
+        }
+        if other.excess(other.error, other.predicted) > self.excess(self.error, self.predicted) {
+            (self.error, self.predicted) = (other.error, other.predicted);
+        }
+    }
+
     /// What the kept error is held to.
     pub(crate) fn bound(&self) -> f64 {
         self.bar.factor * self.predicted
@@ -122,6 +133,17 @@ mod tests {
         let row = row(&[(1.0, 10.0), (0.5, 1.0), (3.0, 100.0)]);
         assert_eq!((row.cases, row.error, row.bound(), row.largest), (3, 0.5, 2.0, 3.0));
         assert!(row.holds());
+    }
+
+    #[test]
+    fn rows_are_absorbed_with_their_worst_case() {
+        let mut first = row(&[(1.0, 10.0), (0.5, 1.0)]);
+        first.absorb(&row(&[(3.0, 100.0)]));
+        assert_eq!((first.cases, first.error, first.largest), (3, 0.5, 3.0));
+        first.absorb(&row(&[(2.5, 1.0)]));
+        assert!(!first.holds());
+        first.absorb(&row(&[(f64::NAN, 1.0)]));
+        assert!(first.largest.is_nan() && first.cases == 5);
     }
 
     #[test]

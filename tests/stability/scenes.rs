@@ -246,8 +246,8 @@ fn numbers() -> Extreme {
 }
 
 /// So many Gaussians on one spot that their lists are as long as the set: nearly transparent ones, all of which a pixel
-/// blends, and opaque ones, of which it blends two.
-pub(crate) fn pile(name: &'static str, count: usize) -> Extreme {
+/// blends, and opaque ones, of which it blends two. The image is square.
+pub(crate) fn pile(name: &'static str, count: usize, side: u32) -> Extreme {
     let pile = |logit: f32| {
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let mut gaussians = blobs(1, 5).select(&vec![0; count]);
@@ -256,7 +256,7 @@ pub(crate) fn pile(name: &'static str, count: usize) -> Extreme {
         }
         gaussians.log_scales.fill([-2.0, -2.5, -3.0]);
         gaussians.logit_opacities.fill_with(|| logit + random.random_range(0.0..0.1));
-        Scene { gaussians, camera: camera(5, 5, 6.0), background: [0.1, 0.2, 0.4] }
+        Scene { gaussians, camera: camera(side, side, 6.0), background: [0.1, 0.2, 0.4] }
     };
     Extreme { name, scenes: [-5.52, 0.0, 9.0].map(pile).into() }
 }

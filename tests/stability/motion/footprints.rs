@@ -8,7 +8,8 @@ use rand::RngExt;
 use splat::{gaussians::Gaussians, motion::MotionSettings, tracking::TrackField};
 
 use super::{
-    judge::{LIFT, Origins, judge_all},
+    judge::{LIFT, Verdict, judge_all, table},
+    prescribed::Tracked,
     scene::{Rig, random},
     wall::Wall,
 };
@@ -39,23 +40,18 @@ fn on_wall(rig: Rig, [wide, high]: [f64; 2], seed: u64) -> Gaussians {
     }
 }
 
-fn row(extreme: &'static str, wall: impl Fn(u64) -> Wall) -> Row {
-    let mut row = Row::new("motion: footprint", extreme, LIFT);
-    let mut origins = Origins::default();
-    for seed in 0..CASES {
+fn row(extreme: &'static str, wall: impl Fn(u64) -> Wall + Sync) -> Verdict {
+    Verdict::of_seeds("motion: footprint", extreme, LIFT, CASES, |verdict, seed| {
         let wall = wall(seed);
-        let field = wall.estimate();
-        judge_all(&mut row, &wall, &field, &MotionSettings::default());
-        origins.add(Origins::of(&field));
-    }
-    row.remark(origins.remark())
+        judge_all(verdict, &wall, &wall.estimate(), &MotionSettings::default());
+    })
 }
 
-fn of_size(extreme: &'static str, size: [f64; 2]) -> Row {
+fn of_size(extreme: &'static str, size: [f64; 2]) -> Verdict {
     row(extreme, |seed| Wall::new(on_wall(Rig::USUAL, size, seed), Rig::USUAL, seed))
 }
 
-fn altered(extreme: &'static str, alter: impl Fn(&mut Gaussians)) -> Row {
+fn altered(extreme: &'static str, alter: impl Fn(&mut Gaussians) + Sync) -> Verdict {
     row(extreme, |seed| {
         let mut gaussians = on_wall(Rig::USUAL, [3.0, 2.0], seed);
         alter(&mut gaussians);
@@ -63,7 +59,15 @@ fn altered(extreme: &'static str, alter: impl Fn(&mut Gaussians)) -> Row {
     })
 }
 
-fn sizes() -> Vec<Row> {
+/// Not rotated, so that its longest axis sticks out of the wall: what the wall shows of it may look like a strain.
+fn across(extreme: &'static str, alter: impl Fn(&mut Gaussians) + Sync) -> Verdict {
+    remarked(
+        altered(extreme, alter).straining(0.5),
+        "taken as unrotated: its longest axis sticks out of the wall",
+    )
+}
+
+fn sizes() -> Vec<Verdict> {
     vec![
         of_size("footprint 0.05 px", [0.05, 0.05]),
         of_size("footprint 0.5 px", [0.5, 0.5]),
@@ -78,7 +82,7 @@ fn sizes() -> Vec<Row> {
     ]
 }
 
-fn parameters() -> Vec<Row> {
+fn parameters() -> Vec<Verdict> {
     let opacity = |logit: f32| move |set: &mut Gaussians| set.logit_opacities[0] = logit;
     let norm = |norm: f32| move |set: &mut Gaussians| set.rotations[0] = set.rotations[0].map(|c| c * norm);
     vec![
@@ -87,19 +91,36 @@ fn parameters() -> Vec<Row> {
         altered("opacity 1 (logit 1e30)", opacity(1e30)),
         altered("quaternion of norm 1e-20", norm(1e-20)),
         altered("quaternion of norm 1e20", norm(1e20)),
-        altered("zero quaternion", norm(0.0)),
+        across("zero quaternion", norm(0.0)),
+        altered("scales of 1e-7 world units", |set| set.log_scales[0] = [1e-7f32.ln(); 3]),
+        altered("scales of 1e4 world units, 1e-7 thick", |set| {
+            set.log_scales[0] = [1e4f32.ln(), 1e4f32.ln(), 1e-7f32.ln()];
+        }),
         altered("log scale -1e30, 1e30 and infinite", |set| set.log_scales[0] = [f32::INFINITY, 1e30, -1e30]),
-        altered("NaN quaternion", |set| set.rotations[0][2] = f32::NAN),
+        across("NaN quaternion", |set| set.rotations[0][2] = f32::NAN),
         altered("NaN mean", |set| set.means[0][1] = f32::NAN),
     ]
 }
 
-fn noises() -> Vec<Row> {
+/// How many parts of the footprint err independently, in every view that has pixels of it.
+fn independent_pixels(wall: &Wall) -> Vec<f64> {
+    let of = |camera| {
+        let samples = wall.samples(0, camera, true);
+        (!samples.is_empty()).then(|| wall.independent_samples(&samples, camera))
+    };
+    wall.cameras.iter().filter_map(of).collect()
+}
+
+fn noises() -> Vec<Verdict> {
     let noisy = |extreme: &'static str, deviation: f64, cell: u32| {
-        row(extreme, move |seed| {
+        let wall = |seed| {
             Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed)
                 .with_noise(deviation, cell, seed)
-        })
+        };
+        let counts: Vec<f64> = (0..CASES).flat_map(|seed| independent_pixels(&wall(seed))).collect();
+        let (least, most) =
+            (counts.iter().copied().fold(f64::MAX, f64::min), counts.iter().copied().fold(0.0, f64::max));
+        remarked(row(extreme, wall), &format!("{least:.1} to {most:.1} independent pixels in a footprint"))
     };
     vec![
         noisy("independent noise 0.1 px", 0.1, 1),
@@ -113,7 +134,7 @@ fn noises() -> Vec<Row> {
 }
 
 /// Tracks that are no positions: every pixel of every view, or a share of them.
-fn invalid_tracks() -> Vec<Row> {
+fn invalid_tracks() -> Vec<Verdict> {
     let spoilt = |extreme: &'static str, share: f64, spoil: fn(&mut TrackField, usize)| {
         row(extreme, move |seed| {
             let wall = Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed);
@@ -156,7 +177,7 @@ fn invalid_tracks() -> Vec<Row> {
     ]
 }
 
-fn outliers() -> Vec<Row> {
+fn outliers() -> Vec<Verdict> {
     let wrong = |extreme: &'static str, share: f64| {
         row(extreme, move |seed| {
             let wall = Wall::new(on_wall(Rig::USUAL, [4.0, 3.0], seed), Rig::USUAL, seed);
@@ -172,14 +193,16 @@ fn outliers() -> Vec<Row> {
 }
 
 /// World scale and origin, fields of view and views, as the real engine sees them.
-fn geometry() -> Vec<Row> {
+fn geometry() -> Vec<Verdict> {
     let usual = Rig::USUAL;
     let of = |extreme: &'static str, rig: Rig| {
         row(extreme, move |seed| Wall::new(on_wall(rig, [1.5, 1.0], seed), rig, seed))
     };
     vec![
-        of("world units 1e-7 of the usual", Rig { distance: 4e-7, ..usual })
-            .remark("all unsolved: before the rasterizer's near plane at 0.01 world units"),
+        remarked(
+            of("world units 1e-7 of the usual", Rig { distance: 4e-7, ..usual }),
+            "before the rasterizer's near plane at 0.01 world units",
+        ),
         of("world units 1e-2 of the usual", Rig { distance: 4e-2, ..usual }),
         of("world units 1e4 of the usual", Rig { distance: 4e4, ..usual }),
         of("world origin 1e3 away", Rig { target: DVec3::new(0.0, -0.6, 0.8) * 1e3, ..usual }),
@@ -191,7 +214,12 @@ fn geometry() -> Vec<Row> {
     ]
 }
 
+fn remarked(mut verdict: Verdict, remark: &str) -> Verdict {
+    verdict.solved.remark = remark.into();
+    verdict
+}
+
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
-    [sizes(), parameters(), geometry(), noises(), invalid_tracks(), outliers()].concat()
+    table([sizes(), parameters(), geometry(), noises(), invalid_tracks(), outliers()].concat())
 }

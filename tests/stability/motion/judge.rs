@@ -1,6 +1,7 @@
 //! Runs the shipped path on a scene and holds every Gaussian to its prediction.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
+use rayon::prelude::*;
 use splat::{
     gaussians::Gaussians,
     motion::{MotionField, MotionOrigin, MotionSettings, apply, estimate},
@@ -8,7 +9,7 @@ use splat::{
 
 use super::{
     prescribed::{Prescribed, Scene, Tracked},
-    reference::{Prediction, Sight, predict, sights},
+    reference::{Prediction, led_deviation, predict, resting_deviation, sights},
 };
 use crate::row::{Bar, Row};
 
@@ -25,6 +26,137 @@ pub(super) const FIELD: Bar = Bar {
     factor: 3.0,
     why: "standard deviation that the tracks claim, 0.05 px at least, through the normal equations; worst of some hundred",
 };
+
+/// For Gaussians found at rest: how far from it they may truly be.
+const AT_REST: Bar = Bar {
+    unit: "world units",
+    factor: 3.0,
+    why: "`static_significance` × the standard deviation of the mean by the views that show least of its motion, just more than \
+          half of them, if each errs by what its tracks claim, or by a third of the floor of 0.2 px, and by its true noise",
+};
+
+/// For Gaussians that follow their neighbours.
+const LED: Bar = Bar {
+    unit: "world units",
+    factor: 3.0,
+    why: "the rigid motion of the 12 nearest solved or resting Gaussians under the noise that their tracks claim, 0.05 px at \
+          least, its turn unknown to its true size; the bodies do not strain",
+};
+
+/// The same where so few are known that their displacements alone do not show how they turn.
+const LED_BY_FEW: Bar = Bar {
+    why: "that of the row of every other Gaussian unseen, and the expected strain of 0.1 × the mean distance of the known: their \
+          turns are not passed on",
+    ..LED
+};
+
+/// What was found of the Gaussians of an extreme, by the origin of their motion.
+#[derive(Clone, Debug)]
+pub(super) struct Verdict {
+    /// A case for every Gaussian: the errors of the solved, and whether the others fell back with reason.
+    pub solved: Row,
+    /// Errors of those found at rest.
+    pub at_rest: Row,
+    /// Errors of those that follow neighbours.
+    pub led: Row,
+    origins: Origins,
+    strained: usize,
+    /// Share of the Gaussians whose scale may change although the motion is rigid.
+    may_strain: f64,
+    /// Departure of a follower from the rigid motion of those it follows, as a share of their distance.
+    may_depart: f64,
+}
+
+impl Verdict {
+    pub(super) fn new(stage: &'static str, extreme: &'static str, bar: Bar) -> Self {
+        Self {
+            solved: Row::new(stage, extreme, bar),
+            at_rest: Row::new("motion: at rest", extreme, AT_REST),
+            led: Row::new("motion: from neighbours", extreme, LED),
+            origins: Origins::default(),
+            strained: 0,
+            may_strain: 0.0,
+            may_depart: 0.0,
+        }
+    }
+
+    /// What `add` finds of every seed.
+    pub(super) fn of_seeds(
+        stage: &'static str,
+        extreme: &'static str,
+        bar: Bar,
+        seeds: u64,
+        add: impl Fn(&mut Self, u64) + Sync,
+    ) -> Self {
+        let of_seed = |seed| {
+            let mut verdict = Self::new(stage, extreme, bar);
+            add(&mut verdict, seed);
+            verdict
+        };
+        let verdicts: Vec<Self> = (0..seeds).into_par_iter().map(of_seed).collect();
+        verdicts.iter().fold(Self::new(stage, extreme, bar), Self::with)
+    }
+
+    fn with(mut self, other: &Self) -> Self {
+        self.solved.absorb(&other.solved);
+        self.at_rest.absorb(&other.at_rest);
+        self.led.absorb(&other.led);
+        self.origins.add(other.origins);
+        self.strained += other.strained;
+        self.may_strain = self.may_strain.max(other.may_strain);
+        self.may_depart = self.may_depart.max(other.may_depart);
+        self.led.bar = other.led.bar;
+        self
+    }
+
+    /// With leave to change the scales of this share of the Gaussians.
+    pub(super) fn straining(mut self, share: f64) -> Self {
+        self.may_strain = self.may_strain.max(share);
+        self
+    }
+
+    /// To be filled by so few known motions that followers may depart by the expected strain.
+    pub(super) fn expect_few(&mut self) {
+        self.may_depart = MotionSettings::default().neighbour_strain;
+        self.led.bar = LED_BY_FEW;
+    }
+
+    fn row(mut self) -> Row {
+        let allowed = self.may_strain * self.origins.all() as f64;
+        if self.strained as f64 > allowed {
+            println!("{}: {} strained, {allowed} may", self.solved.extreme, self.strained);
+            self.solved.case(f64::INFINITY, 0.0);
+        }
+        let strained = match self.strained {
+            0 => String::new(),
+            count => format!("{count} change their scale, {allowed:.0} may"),
+        };
+        let parts = [self.origins.remark(), strained, self.solved.remark.clone()];
+        let parts: Vec<String> = parts.into_iter().filter(|part| !part.is_empty()).collect();
+        self.solved.remark(parts.join("; "))
+    }
+}
+
+/// Share of the Gaussians whose scale may change by chance where tracks are noisy: beyond four standard deviations, which
+/// are estimated.
+const STRAINED_BY_CHANCE: f64 = 0.02;
+
+/// One row per extreme, then one for all that were found at rest, and one for all that followed neighbours if there are
+/// any.
+pub(super) fn table(verdicts: Vec<Verdict>) -> Vec<Row> {
+    let mut at_rest = Row::new("motion: at rest", "whoever is found at rest in the rows above", AT_REST);
+    let mut led = Row::new("motion: from neighbours", "whoever follows neighbours in the rows above", LED);
+    let mut rows = Vec::new();
+    for verdict in verdicts {
+        at_rest.absorb(&verdict.at_rest);
+        if verdict.may_depart == 0.0 {
+            led.absorb(&verdict.led);
+        }
+        rows.push(verdict.row());
+    }
+    rows.extend([at_rest, led].into_iter().filter(|row| row.cases > 0));
+    rows
+}
 
 /// How often each origin was reported.
 #[derive(Clone, Copy, Debug, Default)]
@@ -44,6 +176,10 @@ impl Origins {
             propagated: count(MotionOrigin::Propagated),
             unsolved: count(MotionOrigin::Unsolved),
         }
+    }
+
+    fn all(self) -> usize {
+        self.solved + self.at_rest + self.propagated + self.unsolved
     }
 
     pub(super) fn add(&mut self, other: Self) {
@@ -69,21 +205,33 @@ impl Origins {
     }
 }
 
-/// Whether no entry of a field is NaN or infinite, every rotation is a unit quaternion, and what is reported as
-/// unmoved has not moved.
+/// Whether no entry of a field is NaN or infinite, every rotation is a unit quaternion, no scale changes beyond its bound
+/// or without footprints of its own, and what is reported as unmoved has not moved.
 pub(super) fn is_sound(field: &MotionField, count: usize) -> bool {
-    let lengths =
-        [field.translation.len(), field.rotation.len(), field.origin.len(), field.information.len()];
-    lengths == [count; 4]
-        && field.log_scale.len() == count
-        && field.log_scale.iter().all(|scale| scale.is_finite())
+    let lengths = [
+        field.translation.len(),
+        field.rotation.len(),
+        field.origin.len(),
+        field.information.len(),
+        field.log_scale.len(),
+    ];
+    let most = MotionSettings::default().max_log_strain;
+    lengths == [count; 5]
+        && field.log_scale.iter().all(|strain| strain.is_finite() && strain.abs().max_element() <= most)
         && field.translation.iter().all(|d| d.is_finite())
         && field.rotation.iter().all(|q| q.is_finite() && (q.length() - 1.0).abs() < 1e-9)
         && field.information.iter().all(|h| h.is_finite())
         && (0..count).all(|i| {
             let stays = matches!(field.origin[i], MotionOrigin::Static | MotionOrigin::Unsolved);
-            !stays || (field.translation[i] == DVec3::ZERO && field.rotation[i] == glam::DQuat::IDENTITY)
+            let has_own = field.origin[i] == MotionOrigin::Solved;
+            (!stays || (field.translation[i] == DVec3::ZERO && field.rotation[i] == DQuat::IDENTITY))
+                && (has_own || field.log_scale[i] == DVec3::ZERO)
         })
+}
+
+/// Whether no scale changes at all, as becomes a rigid motion.
+pub(super) fn is_unstrained(field: &MotionField) -> bool {
+    field.log_scale.iter().all(|strain| *strain == DVec3::ZERO)
 }
 
 /// Whether moved Gaussians are where the field says, to the rounding of single precision, and what was finite still is.
@@ -93,7 +241,18 @@ fn is_applied(gaussians: &Gaussians, field: &MotionField) -> bool {
         let expected = gaussians.mean(index) + field.translation[index];
         let rounding = expected.abs() * f64::from(f32::EPSILON) / 2.0;
         let error = (moved.mean(index) - expected).abs();
-        moved.is_finite(index) && error.cmple(rounding + f64::from(f32::MIN_POSITIVE)).all()
+        let strain = field.log_scale[index].to_array();
+        let scales = (0..3).all(|k| {
+            let expected = f64::from(gaussians.log_scales[index][k]) + strain[k];
+            (f64::from(moved.log_scales[index][k]) - expected).abs()
+                <= expected.abs() * f64::from(f32::EPSILON)
+        });
+        let is_turned = field.rotation[index] != DQuat::IDENTITY;
+        let rotations = is_turned || moved.rotations[index] == gaussians.rotations[index];
+        moved.is_finite(index)
+            && error.cmple(rounding + f64::from(f32::MIN_POSITIVE)).all()
+            && scales
+            && rotations
     })
 }
 
@@ -119,37 +278,48 @@ fn demand(prediction: Option<&Prediction>, cameras: usize, settings: &MotionSett
     }
 }
 
-/// Estimates the motion of every Gaussian alone and adds a case for each to the row.
-pub(super) fn lone(row: &mut Row, scene: &Scene) -> Origins {
-    let mut origins = Origins::default();
+/// Estimates the motion of every Gaussian alone and adds a case for each.
+pub(super) fn lone(verdict: &mut Verdict, scene: &Scene) {
     for index in 0..scene.gaussians.len() {
-        origins.add(together(row, &Scene { gaussians: scene.gaussians.select(&[index]), ..scene.clone() }));
+        together(verdict, &Scene { gaussians: scene.gaussians.select(&[index]), ..scene.clone() });
     }
-    origins
 }
 
-/// Estimates the motion of all Gaussians together and adds a case for each to the row.
-pub(super) fn together(row: &mut Row, scene: &Scene) -> Origins {
+/// Estimates the motion of all Gaussians together and adds a case for each.
+pub(super) fn together(verdict: &mut Verdict, scene: &Scene) {
     let settings = MotionSettings::default();
     let field = estimate(&Prescribed(scene), &scene.gaussians, &scene.views(), &settings).unwrap();
-    judge_all(row, scene, &field, &settings);
-    Origins::of(&field)
+    judge_all(verdict, scene, &field, &settings);
 }
 
-/// Adds a case for every Gaussian of a field.
-pub(super) fn judge_all(row: &mut Row, scene: &impl Tracked, field: &MotionField, settings: &MotionSettings) {
-    if !is_sound(field, scene.gaussians().len()) {
-        row.case(f64::NAN, 1.0);
+/// Adds a case for every Gaussian of the field of a rigid scene.
+pub(super) fn judge_all(
+    verdict: &mut Verdict,
+    scene: &impl Tracked,
+    field: &MotionField,
+    settings: &MotionSettings,
+) {
+    verdict.origins.add(Origins::of(field));
+    if !is_sound(field, scene.gaussians().len()) || !is_applied(scene.gaussians(), field) {
+        println!("{}: not sound, or not applied", verdict.solved.extreme);
+        verdict.solved.case(f64::NAN, 1.0);
     }
-    if !is_applied(scene.gaussians(), field) {
-        row.case(f64::INFINITY, 0.0);
+    verdict.strained += field.log_scale.iter().filter(|strain| **strain != DVec3::ZERO).count();
+    if scene.noise().deviation() > 0.0 {
+        verdict.may_strain = verdict.may_strain.max(STRAINED_BY_CHANCE);
     }
     for index in 0..scene.gaussians().len() {
-        judge(row, scene, field, index, settings);
+        judge(verdict, scene, field, index, settings);
     }
 }
 
-fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize, settings: &MotionSettings) {
+fn judge(
+    verdict: &mut Verdict,
+    scene: &impl Tracked,
+    field: &MotionField,
+    index: usize,
+    settings: &MotionSettings,
+) {
     let mean = scene.gaussians().mean(index);
     let truth = scene.motion().of(mean);
     let sights = sights(scene, index, settings);
@@ -161,10 +331,11 @@ fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize,
         demand => demand,
     };
     let error = (mean + field.translation[index] - truth).length();
+    // Rounding of a world position, when its origin is far.
+    let rounding = f64::EPSILON * (mean.length() + truth.length());
+    let row = &mut verdict.solved;
     match (field.origin[index], prediction) {
         (MotionOrigin::Solved, Some(prediction)) if demand != Demand::Fallback => {
-            // Rounding of a world position, when its origin is far.
-            let rounding = f64::EPSILON * (mean.length() + truth.length());
             let told = if scene.gaussians().len() > 1 { prediction.assumed } else { 0.0 };
             let predicted = prediction.deviation.hypot(told) + rounding;
             if error > row.bar.factor * predicted {
@@ -173,9 +344,27 @@ fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize,
             let from_reference = (mean + field.translation[index] - prediction.position).length();
             row.case(error.max(if told > 0.0 { 0.0 } else { from_reference }), predicted);
         }
-        (MotionOrigin::Static, Some(_)) if rests(&sights, mean, settings) => row.case(0.0, 0.0),
+        (MotionOrigin::Static, Some(_)) => {
+            let predicted = resting_deviation(&sights, mean, settings) + rounding;
+            if error > AT_REST.factor * predicted {
+                println!("{}: {error} from rest, predicted {predicted}", row.extreme);
+            }
+            verdict.at_rest.case(error, predicted);
+            row.case(0.0, 0.0);
+        }
+        (MotionOrigin::Propagated, _) if demand != Demand::Solved => {
+            let (deviation, distance) = led_deviation(scene, field, index, settings).unwrap_or_default();
+            let predicted = deviation.hypot(verdict.may_depart * distance) + rounding;
+            if error > LED.factor * predicted {
+                println!("{}: {error} behind its neighbours, predicted {predicted}", row.extreme);
+            }
+            verdict.led.case(error, predicted);
+            row.case(0.0, 0.0);
+        }
         (MotionOrigin::Solved | MotionOrigin::Static, _) => refuse(row, "without grounds", prediction, error),
         (_, Some(_)) if demand == Demand::Solved => refuse(row, "fell back without need", prediction, error),
+        // The bodies hang together: one known motion leads to all others.
+        _ if field.origin.contains(&MotionOrigin::Solved) => refuse(row, "left behind", prediction, error),
         _ => row.case(0.0, 0.0),
     }
 }
@@ -183,14 +372,4 @@ fn judge(row: &mut Row, scene: &impl Tracked, field: &MotionField, index: usize,
 fn refuse(row: &mut Row, what: &str, prediction: Option<Prediction>, error: f64) {
     println!("{}: {what}, error {error}, {prediction:?}", row.extreme);
     row.case(f64::INFINITY, 0.0);
-}
-
-/// Whether most views find a displacement that is small or, at twice the limit for chance, insignificant.
-fn rests(sights: &[Sight<'_>], mean: DVec3, settings: &MotionSettings) -> bool {
-    let is_small = |sight: &&Sight<'_>| {
-        let Some(before) = sight.camera.project_world(mean) else { return false };
-        let limit = settings.static_significance * sight.assumed_variance.sqrt();
-        (sight.pixel - before).length() <= 2.0 * limit.max(settings.static_floor)
-    };
-    2 * sights.iter().filter(is_small).count() >= sights.len()
 }

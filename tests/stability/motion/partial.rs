@@ -7,6 +7,7 @@ use super::{
     judge::is_sound,
     lift::body,
     prescribed::{Noise, Prescribed, Scene, Stray},
+    reference::{LEAST_CLAIM, sights},
     scene::{Rig, direction, random},
 };
 use crate::row::{Bar, Row};
@@ -14,11 +15,15 @@ use crate::row::{Bar, Row};
 const SEEN: Bar = Bar {
     unit: "px",
     factor: 4.0,
-    why: "track noise and its floor in the only view; a fiftieth of the neighbours' pull against it",
+    why: "track noise in the only view, the rounding of a mean, and the share v / (v + s²/12) of its stray that the variance v \
+          which its track claims leaves to 12 neighbours of expected strain s",
 };
 
-const UNSEEN: Bar =
-    Bar { unit: "world units", factor: 4.0, why: "expected strain × distance of the neighbours" };
+const UNSEEN: Bar = Bar {
+    unit: "world units",
+    factor: 4.0,
+    why: "the length of its stray, and the neighbours' own errors by 0.001 px of track",
+};
 
 /// How far the Gaussian strays from its body, in expected strains of its neighbourhood.
 fn strayed(strains: f64, noise: f64, seed: u64) -> (Scene, f64) {
@@ -57,12 +62,22 @@ fn rows_of(extreme: [&'static str; 2], strains: f64, noise: f64) -> [Row; 2] {
         followed += 1;
         let truth = scene.motion.of(stray.mean) + stray.shift;
         let found = stray.mean + field.translation[index];
-        let camera = &scene.cameras[0];
+        // What its track errs by; the stray itself is no error.
+        let body = Scene { stray: Some(Stray { shift: DVec3::ZERO, ..stray }), ..scene.clone() };
+        let sights = sights(&body, index, &settings);
+        let camera = sights[0].camera;
         let error = camera.project_world(found).unwrap() - camera.project_world(truth).unwrap();
-        let deviation = (noise * noise / 2.2 + settings.noise_floor.powi(2)).sqrt();
-        seen.case(error.length(), deviation);
+        let depth = camera.to_camera(truth).z;
+        let in_pixels = |length: f64| length * camera.fx / depth;
+        // The fixed point of own information 1 / v and twelve ties of 1 / s² each.
+        let ties = in_pixels(strain).powi(2) / settings.neighbours as f64;
+        let pull = in_pixels(stray.shift.length()) * sights[0].assumed_variance
+            / (sights[0].assumed_variance + ties);
+        let rounding = in_pixels(f64::from(f32::EPSILON) * stray.mean.length());
+        seen.case(error.length(), sights[0].deviation.hypot(pull) + rounding);
         let ray: DVec3 = (truth - camera.centre()).normalize();
-        unseen.case((found - truth).dot(ray).abs(), strain);
+        let own = LEAST_CLAIM.max(noise) * depth / camera.fx;
+        unseen.case((found - truth).dot(ray).abs(), stray.shift.length().hypot(own));
     }
     [seen.remark(format!("{followed} from neighbours")), unseen]
 }

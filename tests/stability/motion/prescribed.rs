@@ -42,14 +42,27 @@ pub(super) enum Noise {
     Independent(f64),
     /// All samples of a footprint alike.
     Alike(f64),
+    /// Those of a square cell of pixels alike.
+    Cells(f64),
 }
 
 impl Noise {
     pub(super) fn deviation(self) -> f64 {
         match self {
-            Self::Independent(deviation) | Self::Alike(deviation) => deviation,
+            Self::Independent(deviation) | Self::Alike(deviation) | Self::Cells(deviation) => deviation,
         }
     }
+}
+
+/// Effective number of samples, `(Σ w)² / Σ w²`.
+pub(super) fn effective_samples(samples: &[Sample]) -> f64 {
+    effective_number(samples.iter().map(|sample| sample.weight))
+}
+
+/// Effective number of parts of which the weights are given.
+pub(super) fn effective_number(weights: impl Iterator<Item = f64>) -> f64 {
+    let (sum, squares) = weights.fold((0.0, 0.0), |(sum, squares), w| (sum + w, squares + w * w));
+    sum * sum / squares
 }
 
 /// A scene of which every tracked point of every Gaussian is known.
@@ -63,6 +76,14 @@ pub(super) trait Tracked {
     /// Whether most tracked points of the right views are right, so that falling back is not called for.
     fn is_answerable(&self) -> bool {
         true
+    }
+    /// Number of samples whose errors, independent of each other, would leave the same error in their mean: that of the
+    /// parts of the footprint that err alike.
+    fn independent_samples(&self, samples: &[Sample], _: &Camera) -> f64 {
+        match self.noise() {
+            Noise::Independent(_) => effective_samples(samples),
+            Noise::Alike(_) | Noise::Cells(_) => 1.0,
+        }
     }
     /// The rightly tracked points of a Gaussian in one view, with the noise of the tracks or without.
     fn samples(&self, index: usize, camera: &Camera, is_noisy: bool) -> Vec<Sample>;
@@ -170,7 +191,7 @@ fn sampled(
             let error = match scene.noise {
                 _ if !is_noisy => DVec2::ZERO,
                 Noise::Independent(deviation) => pair() * deviation,
-                Noise::Alike(deviation) => alike * deviation,
+                Noise::Alike(deviation) | Noise::Cells(deviation) => alike * deviation,
             };
             let from = camera.project_world(point);
             let to = camera.project_world(motion.of(point)).map(|exact| exact + lost + error);
@@ -186,6 +207,8 @@ fn sampled(
     let total: f64 = samples.iter().map(|sample| sample.weight).sum();
     let unoccluded = unoccluded_weight(gaussians, index, camera);
     samples.iter_mut().for_each(|sample| sample.weight *= unoccluded / total);
+    // What is not in the image at the key frame has no pixels.
+    samples.retain(|sample| camera.contains(sample.from));
     samples
 }
 
@@ -199,7 +222,7 @@ pub(super) fn major_axes(gaussians: &Gaussians, index: usize) -> [DVec3; 2] {
 }
 
 /// What the blending weights of a Gaussian with nothing before it add up to.
-fn unoccluded_weight(gaussians: &Gaussians, index: usize, camera: &Camera) -> f64 {
+pub(super) fn unoccluded_weight(gaussians: &Gaussians, index: usize, camera: &Camera) -> f64 {
     let [u, v] = camera.world_jacobian(camera.to_camera(gaussians.mean(index)));
     let covariance = gaussians.covariance(index);
     let uv = u.dot(covariance * v);

@@ -2,10 +2,13 @@
 //! propagation predicts of its error.
 
 use glam::{DVec2, DVec3};
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
-use splat::{cameras::Camera, motion::MotionSettings};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix3x6, Matrix6, Vector3, Vector6};
+use splat::{
+    cameras::Camera,
+    motion::{MotionField, MotionOrigin, MotionSettings},
+};
 
-use super::prescribed::{Noise, Sample, Scene, Tracked, major_axes};
+use super::prescribed::{Sample, Scene, Tracked, effective_samples, major_axes};
 
 /// Where one view sees the Gaussian go.
 #[derive(Clone, Copy, Debug)]
@@ -16,6 +19,8 @@ pub(super) struct Sight<'a> {
     pub deviation: f64,
     /// Variance per axis that the shipped path may assume: the track's own, its correlation and the floor.
     pub assumed_variance: f64,
+    /// The part of it that the tracks claim, and the floor.
+    pub claimed_variance: f64,
 }
 
 /// What the views of one Gaussian determine.
@@ -52,18 +57,24 @@ struct Affine {
 
 fn affine(samples: &[Sample], mean: DVec2) -> Affine {
     let weight: f64 = samples.iter().map(|s| s.weight).sum();
+    // About the centroid, so that samples on a line share their common motion among no other unknowns.
+    let centroid = samples.iter().map(|s| s.from * s.weight).sum::<DVec2>() / weight;
     let root = |row: usize| (samples[row].weight / weight).sqrt();
     let design = DMatrix::from_fn(samples.len(), 3, |row, column| {
-        let offset = samples[row].from - mean;
+        let offset = samples[row].from - centroid;
         root(row) * [1.0, offset.x, offset.y][column]
     });
     let right = DMatrix::from_fn(samples.len(), 2, |row, column| {
         root(row) * (samples[row].to - samples[row].from)[column]
     });
     let svd = design.clone().svd(true, true);
-    let solution = svd.solve(&right, 1e-12 * svd.singular_values.max()).expect("both factors were asked for");
+    // What lies on a line says nothing of the motion across it.
+    let solution = svd.solve(&right, 1e-3 * svd.singular_values.max()).expect("both factors were asked for");
+    let offset = mean - centroid;
+    let displacement =
+        |axis| solution[(0, axis)] + solution[(1, axis)] * offset.x + solution[(2, axis)] * offset.y;
     Affine {
-        target: mean + DVec2::new(solution[(0, 0)], solution[(0, 1)]),
+        target: mean + DVec2::new(displacement(0), displacement(1)),
         strain: solution.rows(1, 2).norm(),
         residual: 0.5 * (design * &solution - right).norm_squared(),
     }
@@ -102,32 +113,47 @@ fn sight<'a>(
     // A fit may as well take the centroid's motion for the mean's.
     let model_error =
         (noiseless.target - exact).length() + (centroid - projected).length() * noiseless.strain;
-    let effective = weight(&seen).powi(2) / seen.iter().map(|s| s.weight * s.weight).sum::<f64>();
-    let noise = match scene.noise() {
-        Noise::Independent(deviation) => deviation / effective.sqrt(),
-        Noise::Alike(deviation) => deviation,
-    };
-    let independent = 1.0 + (effective - 1.0) / settings.noise_correlation_area;
-    let claimed = scene.noise().deviation().max(LEAST_CLAIM).powi(2);
-    let assumed_variance = claimed.max(fit.residual) / independent + settings.noise_floor.powi(2);
-    Some(Sight { camera, pixel: fit.target, deviation: noise.hypot(model_error), assumed_variance })
+    let deviation = scene.noise().deviation();
+    let noise = deviation / scene.independent_samples(&seen, camera).sqrt();
+    let independent = 1.0 + (effective_samples(&seen) - 1.0) / settings.noise_correlation_area;
+    let claimed = deviation.max(LEAST_CLAIM).powi(2);
+    let floor = settings.noise_floor.powi(2);
+    Some(Sight {
+        camera,
+        pixel: fit.target,
+        deviation: noise.hypot(model_error),
+        assumed_variance: claimed.max(fit.residual) / independent + floor,
+        claimed_variance: claimed / independent + floor,
+    })
 }
 
-/// Gauss-Newton on all sights at once from the true position, to convergence.
+/// Gauss-Newton on all sights at once from the true position, to convergence; a step is halved until it is one downhill.
 pub(super) fn predict(sights: &[Sight<'_>], truth: DVec3) -> Option<Prediction> {
     let first = sights.first()?;
+    let at = |offset: Vector3<f64>| truth + DVec3::from_slice(offset.as_slice());
+    let cost =
+        |offset| linearise(sights, at(offset)).map_or(f64::INFINITY, |(_, right)| right.norm_squared());
     let mut offset = Vector3::zeros();
     for _ in 0..30 {
-        let (design, residual) = linearise(sights, truth + DVec3::from_slice(offset.as_slice()))?;
+        let (design, residual) = linearise(sights, at(offset))?;
         let svd = design.svd(true, true);
         let step = svd.solve(&residual, 1e-14 * svd.singular_values.max()).ok()?;
-        let step = Vector3::new(step[0], step[1], step[2]);
+        let mut step = Vector3::new(step[0], step[1], step[2]);
+        let before = residual.norm_squared();
+        let is_downhill = (0..40).any(|_| {
+            let found = cost(offset + step) < before;
+            step *= if found { 1.0 } else { 0.5 };
+            found
+        });
+        if !is_downhill {
+            break;
+        }
         offset += step;
         if !(step.norm() > 1e-14 * offset.norm()) {
             break;
         }
     }
-    let position = truth + DVec3::from_slice(offset.as_slice());
+    let position = at(offset);
     let (covariance, assumed) = covariances(sights, truth);
     let depth = first.camera.to_camera(truth).z;
     let assumed = assumed.symmetric_eigenvalues().max().max(0.0).sqrt();
@@ -147,6 +173,80 @@ fn linearise(sights: &[Sight<'_>], at: DVec3) -> Option<(DMatrix<f64>, DVector<f
         }
     }
     Some((design, right))
+}
+
+/// Standard deviation of a mean that is found at rest, by the views that its displacement is least significant in, just
+/// more than half of all: a majority decides. Each errs by its share of the significance, which is what its tracks claim or
+/// the floor over the significance, and by their true deviation.
+pub(super) fn resting_deviation(sights: &[Sight<'_>], mean: DVec3, settings: &MotionSettings) -> f64 {
+    let least = (settings.static_floor / settings.static_significance).powi(2);
+    let mut resting: Vec<(f64, Sight<'_>)> = sights
+        .iter()
+        .map(|sight| {
+            // Where the footprint is found errs as well.
+            let deviation = sight.claimed_variance.max(least).sqrt() + sight.deviation;
+            let before = sight.camera.project_world(mean).unwrap_or(DVec2::INFINITY);
+            let variance = sight.claimed_variance.max(least);
+            let significance = before.distance_squared(sight.pixel) / variance;
+            (significance, Sight { assumed_variance: deviation * deviation, ..*sight })
+        })
+        .collect();
+    resting.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let majority: Vec<Sight<'_>> =
+        resting.iter().take(sights.len() / 2 + 1).map(|(_, sight)| *sight).collect();
+    covariances(&majority, mean).1.trace().sqrt()
+}
+
+/// Standard deviation of the position of Gaussian `index` by the rigid motion of the nearest ones of known motion, to first
+/// order: least squares of their displacements by the information that the shipped path may assume, with the turn free
+/// within its true size; and the mean distance of those. `None` if no motion is known.
+pub(super) fn led_deviation(
+    scene: &impl Tracked,
+    field: &MotionField,
+    index: usize,
+    settings: &MotionSettings,
+) -> Option<(f64, f64)> {
+    let (gaussians, motion) = (scene.gaussians(), scene.motion());
+    let mean = gaussians.mean(index);
+    let is_known =
+        |other: &usize| matches!(field.origin[*other], MotionOrigin::Solved | MotionOrigin::Static);
+    let mut known: Vec<usize> = (0..gaussians.len()).filter(is_known).collect();
+    known.sort_by(|&a, &b| gaussians.mean(a).distance(mean).total_cmp(&gaussians.mean(b).distance(mean)));
+    known.truncate(settings.neighbours);
+    // Units that make both halves of the unknowns alike.
+    let size = gaussians.mean(*known.last()?).distance(mean).max(f64::MIN_POSITIVE);
+    let unit = known.iter().find_map(|&other| position_covariance(scene, other, settings))?.trace();
+    let mut normal = Matrix6::zeros();
+    let distance =
+        known.iter().map(|&other| gaussians.mean(other).distance(mean)).sum::<f64>() / known.len() as f64;
+    for other in known {
+        let Some(information) =
+            position_covariance(scene, other, settings).and_then(|c| (c / unit).try_inverse())
+        else {
+            continue;
+        };
+        let lever = vector((gaussians.mean(other) - mean) / size);
+        let mut by_motion = Matrix3x6::zeros();
+        by_motion.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
+        by_motion.fixed_view_mut::<3, 3>(0, 3).copy_from(&-lever.cross_matrix());
+        normal += by_motion.transpose() * information * by_motion;
+    }
+    let turn = (motion.turn.angle_between(glam::DQuat::IDENTITY) * size).max(1e-9 * size);
+    for axis in 3..6 {
+        normal[(axis, axis)] += unit / (turn * turn);
+    }
+    let covariance = normal.try_inverse()?.fixed_view::<3, 3>(0, 0).trace() * unit;
+    covariance.is_finite().then(|| (covariance.sqrt(), distance))
+}
+
+/// Covariance that the shipped path may assume of a position.
+fn position_covariance(
+    scene: &impl Tracked,
+    index: usize,
+    settings: &MotionSettings,
+) -> Option<Matrix3<f64>> {
+    let sights = sights(scene, index, settings);
+    (!sights.is_empty()).then(|| covariances(&sights, scene.motion().of(scene.gaussians().mean(index))).1)
 }
 
 /// Covariance of the least-squares position under the true noise, and the one that follows from the assumed noise.

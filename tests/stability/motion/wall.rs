@@ -1,20 +1,21 @@
 //! Gaussians on a moving wall, measured by the real engine; footprints are those of a plain double-precision
 //! rasterizer of one Gaussian.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 use glam::{DMat2, DVec2, DVec3};
 use rand::RngExt;
 use splat::{
     cameras::Camera,
+    engine::Engine,
     gaussians::Gaussians,
-    motion::{MotionField, MotionSettings, MotionView, estimate},
+    motion::{MotionField, MotionSettings, MotionView, estimate, moments::FootprintMoments},
     raster::{ALPHA_MAX, ALPHA_MIN, CpuEngine, LOW_PASS, NEAR_PLANE},
     tracking::TrackField,
 };
 
 use super::{
-    prescribed::{Noise, Sample, Tracked},
+    prescribed::{Noise, Sample, Tracked, effective_number},
     reference::LEAST_CLAIM,
     scene::{Rig, Rigid, normal, random},
 };
@@ -35,6 +36,8 @@ pub(super) struct Wall {
     /// Share of the pixels whose tracks are wrong, and which they are, by view.
     outliers: f64,
     is_wrong: Vec<Vec<bool>>,
+    /// Side of the cells that err alike, pixels, and where in a cell the image begins, by view.
+    cells: (u32, Vec<[u32; 2]>),
 }
 
 impl Wall {
@@ -53,7 +56,8 @@ impl Wall {
         let noise = Noise::Independent(0.0);
         let is_wrong = vec![vec![false; (WIDTH * HEIGHT) as usize]; cameras.len()];
         let tracks = exact.clone();
-        Self { gaussians, cameras, motion, noise, exact, tracks, outliers: 0.0, is_wrong }
+        let cells = (1, vec![[0; 2]; cameras.len()]);
+        Self { gaussians, cameras, motion, noise, exact, tracks, outliers: 0.0, is_wrong, cells }
     }
 
     /// With what `change` makes of each view's tracks.
@@ -66,13 +70,18 @@ impl Wall {
 
     /// With normal errors of the tracks that are alike within cells of `cell` pixels, which the tracks claim.
     pub(super) fn with_noise(mut self, deviation: f64, cell: u32, seed: u64) -> Self {
-        self.noise = if cell > 1 { Noise::Alike(deviation) } else { Noise::Independent(deviation) };
+        self.noise = if cell > 1 { Noise::Cells(deviation) } else { Noise::Independent(deviation) };
+        // Cells begin anywhere.
+        let first = |view: usize| {
+            let mut random = random(seed ^ ((view as u64) << 24));
+            [random.random_range(0..cell), random.random_range(0..cell)]
+        };
+        self.cells = (cell, (0..self.cameras.len()).map(first).collect());
         self.with_tracks(|view, tracks| {
+            let first = first(view);
             let mut random = random(seed ^ ((view as u64) << 32));
             let columns = WIDTH.div_ceil(cell) + 1;
             let cells = columns * (HEIGHT.div_ceil(cell) + 1);
-            // Cells begin anywhere.
-            let first = [random.random_range(0..cell), random.random_range(0..cell)];
             let errors: Vec<[f64; 2]> =
                 (0..cells).map(|_| [normal(&mut random), normal(&mut random)]).collect();
             tracks.sigma.fill(deviation.max(LEAST_CLAIM) as f32);
@@ -118,6 +127,16 @@ impl Wall {
     }
 }
 
+impl Wall {
+    /// What the real engine measures in each view.
+    pub(super) fn moments(&self) -> Vec<Vec<FootprintMoments>> {
+        let of = |(camera, tracks): (&Camera, &Arc<TrackField>)| {
+            CpuEngine::default().footprint_moments(&self.gaussians, camera, tracks, None).unwrap()
+        };
+        self.cameras.iter().zip(&self.tracks).map(of).collect()
+    }
+}
+
 /// Exact tracks of the wall's points, visible where they stay inside the image.
 fn tracks(camera: &Camera, centre: DVec3, motion: Rigid) -> TrackField {
     let pixels = (camera.width * camera.height) as usize;
@@ -150,6 +169,12 @@ fn pixel_centre(pixel: usize, width: u32) -> DVec2 {
     DVec2::new((pixel % width as usize) as f64 + 0.5, (pixel / width as usize) as f64 + 0.5)
 }
 
+impl Wall {
+    fn view_of(&self, camera: &Camera) -> usize {
+        self.cameras.iter().position(|other| other == camera).expect("one of the wall's cameras")
+    }
+}
+
 impl Tracked for Wall {
     fn gaussians(&self) -> &Gaussians {
         &self.gaussians
@@ -175,9 +200,20 @@ impl Tracked for Wall {
         self.outliers < 0.5
     }
 
+    fn independent_samples(&self, samples: &[Sample], camera: &Camera) -> f64 {
+        let view = self.view_of(camera);
+        let (side, [left, top]) = (self.cells.0, self.cells.1[view]);
+        let mut weights = BTreeMap::new();
+        for sample in samples {
+            let cell = [sample.from.x as u32 + left, sample.from.y as u32 + top].map(|place| place / side);
+            *weights.entry(cell).or_insert(0.0) += sample.weight;
+        }
+        effective_number(weights.into_values())
+    }
+
     /// Every pixel on which the Gaussian has at least 1/255 of opacity.
     fn samples(&self, index: usize, camera: &Camera, is_noisy: bool) -> Vec<Sample> {
-        let view = self.cameras.iter().position(|other| other == camera).expect("one of the wall's cameras");
+        let view = self.view_of(camera);
         let tracks = if is_noisy { &self.tracks[view] } else { &self.exact[view] };
         let position = camera.to_camera(self.gaussians.mean(index));
         let Some(mean) = camera.project(position).filter(|_| position.z > NEAR_PLANE) else {
@@ -191,13 +227,19 @@ impl Tracked for Wall {
             DVec2::new(uv, v.dot(covariance * v) + LOW_PASS),
         );
         let conic = footprint.inverse();
+        let opacity = self.gaussians.opacity(index);
         let sample = |pixel: usize| {
-            if is_noisy && self.is_wrong[view][pixel] {
+            let offset = pixel_centre(pixel, camera.width) - mean;
+            let half_square = 0.5 * offset.dot(conic * offset);
+            // exp(-6) is below the least alpha of an opaque Gaussian.
+            if half_square > 6.0 {
                 return None;
             }
-            let offset = pixel_centre(pixel, camera.width) - mean;
-            let alpha = self.gaussians.opacity(index) * (-0.5 * offset.dot(conic * offset)).exp();
+            let alpha = opacity * (-half_square).exp();
             if alpha < f64::from(ALPHA_MIN) {
+                return None;
+            }
+            if is_noisy && self.is_wrong[view][pixel] {
                 return None;
             }
             let to = DVec2::from_array(tracks.positions[pixel].map(f64::from));
