@@ -8,6 +8,7 @@
 mod algorithms;
 mod golden;
 mod moments;
+mod probe;
 mod scenes;
 mod session;
 mod support;

@@ -1,7 +1,5 @@
 //! Footprint moments beside those of the CPU engine, which is held against double precision where it is defined.
 
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use splat::{
     cameras::Camera,
     engine::{Engine, EngineError},
@@ -11,34 +9,9 @@ use splat::{
     tracking::TrackField,
 };
 
-use crate::support::{arc, blobs, engine};
+use crate::support::{arc, blobs, engine, rough_tracks};
 
 const REWEIGHTING: Reweighting = Reweighting { passes: 3, noise_correlation_area: 1.0, noise_floor: 0.05 };
-
-/// Bent, noisy tracks, those of one side `jump` px further, hidden pixels and claims from 0.01 to 3 px.
-fn rough_tracks(camera: &Camera, jump: f64, seed: u64) -> TrackField {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut field = TrackField {
-        width: camera.width,
-        height: camera.height,
-        positions: Vec::new(),
-        visible: Vec::new(),
-        sigma: Vec::new(),
-    };
-    let pixels = (0..camera.height).flat_map(|row| (0..camera.width).map(move |column| (column, row)));
-    for (column, row) in pixels {
-        let (x, y) = (f64::from(column) + 0.5, f64::from(row) + 0.5);
-        let sigma: f64 = 0.01 * 300f64.powf(random.random_range(0.0..1.0));
-        let jump = if x + 0.3 * y > 40.0 { jump } else { 0.0 };
-        let mut noise = || sigma * random.random_range(-1.7..1.7);
-        let bend = 0.07 * x * x / f64::from(camera.width);
-        let target = [x + 3.0 + 0.05 * y + bend + jump + noise(), y - 2.0 - 0.03 * x + noise()];
-        field.positions.push(target.map(|value| value as f32));
-        field.visible.push(random.random_range(0.0..1.0) > 0.1);
-        field.sigma.push(sigma as f32);
-    }
-    field
-}
 
 fn measure(
     gaussians: &Gaussians,
@@ -69,8 +42,8 @@ fn difference(found: &FootprintMoments, exact: &FootprintMoments) -> [f64; 3] {
     ]
 }
 
-/// Sums are good to what the CPU engine's are: 2e-5 px, 5e-6 of the second moments (`src/tests/moments.rs` holds them alone
-/// against double precision). Projection in single precision adds 1e-7 of the image's size to a footprint's place, and up to six
+/// Sums are good to what the CPU engine's are: 2e-5 px, 5e-6 of the second moments (`src/tests/moments.rs` holds them
+/// against double precision on the device's own footprints). Projection in single precision adds 1e-7 of the image's size to a footprint's place, and up to six
 /// times that to a pixel's weight, as the steepest footprint falls by six of its weight per pixel; means follow the place, and
 /// tracks bend by up to two pixels per pixel.
 fn assert_measured_alike(
