@@ -36,7 +36,8 @@ impl GpuCheck {
         if data.exists() {
             fs::remove_dir_all(&data).with_context(|| format!("cannot empty {}", data.display()))?;
         }
-        fs::create_dir_all(&data).with_context(|| format!("cannot make {}", data.display()))?;
+        let folder = if self.scene.is_empty() { &self.out } else { &data };
+        fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
         copy(&program, &self.out.join(PROGRAM))?;
         let mut names = Vec::new();
         for scene in &self.scene {
