@@ -17,7 +17,9 @@ mod device;
 mod engine;
 mod kernels;
 mod layout;
+mod moments;
 mod optimise;
+mod probe;
 mod program;
 mod readback;
 mod session;
@@ -28,3 +30,4 @@ mod wanted;
 
 pub use device::{DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, devices};
 pub use engine::GpuEngine;
+pub use probe::{Probe, Stage};

@@ -7,6 +7,7 @@
 
 mod layout;
 mod lost;
+mod moments;
 mod optimisation;
 mod projection;
 mod sorting;

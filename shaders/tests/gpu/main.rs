@@ -7,6 +7,8 @@
 
 mod algorithms;
 mod golden;
+mod moments;
+mod probe;
 mod scenes;
 mod session;
 mod support;

@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 use glam::{DMat3, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use splat::{cameras::Camera, gaussians::Gaussians};
+use splat::{cameras::Camera, gaussians::Gaussians, tracking::TrackField};
 use splat_shaders::{DeviceChoice, GpuDevice, GpuEngine, devices};
 
 /// The engine of this test program; `None` if the environment says that there is no device.
@@ -85,4 +85,29 @@ pub(crate) fn blobs(count: usize, sh_degree: u32, seed: u64) -> Gaussians {
 /// Numbers between -1 and 1.
 pub(crate) fn seeds(count: usize) -> Vec<f32> {
     (0..count).map(|place| (place as f32 * 12.9898).sin()).collect()
+}
+
+/// Bent, noisy tracks, those of one side `jump` px further, hidden pixels and claims from 0.01 to 3 px.
+pub(crate) fn rough_tracks(camera: &Camera, jump: f64, seed: u64) -> TrackField {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut field = TrackField {
+        width: camera.width,
+        height: camera.height,
+        positions: Vec::new(),
+        visible: Vec::new(),
+        sigma: Vec::new(),
+    };
+    let pixels = (0..camera.height).flat_map(|row| (0..camera.width).map(move |column| (column, row)));
+    for (column, row) in pixels {
+        let (x, y) = (f64::from(column) + 0.5, f64::from(row) + 0.5);
+        let sigma: f64 = 0.01 * 300f64.powf(random.random_range(0.0..1.0));
+        let jump = if x + 0.3 * y > 40.0 { jump } else { 0.0 };
+        let mut noise = || sigma * random.random_range(-1.7..1.7);
+        let bend = 0.07 * x * x / f64::from(camera.width);
+        let target = [x + 3.0 + 0.05 * y + bend + jump + noise(), y - 2.0 - 0.03 * x + noise()];
+        field.positions.push(target.map(|value| value as f32));
+        field.visible.push(random.random_range(0.0..1.0) > 0.1);
+        field.sigma.push(sigma as f32);
+    }
+    field
 }
