@@ -31,8 +31,7 @@ pub(super) const FIELD: Bar = Bar {
 const AT_REST: Bar = Bar {
     unit: "world units",
     factor: 3.0,
-    why: "`static_significance` × the standard deviation of the mean by the views that show least of its motion, just more than \
-          half of them, if each errs by what its tracks claim, or by a third of the floor of 0.2 px, and by its true noise",
+    why: "`static_significance` × the standard deviation of the mean if every view that sees it errs by what its tracks claim, or by a third of the floor of 0.2 px, and by its true noise",
 };
 
 /// For Gaussians that follow their neighbours.
@@ -41,13 +40,6 @@ const LED: Bar = Bar {
     factor: 3.0,
     why: "the rigid motion of the 12 nearest solved or resting Gaussians under the noise that their tracks claim, 0.05 px at \
           least, its turn unknown to its true size; the bodies do not strain",
-};
-
-/// The same where so few are known that their displacements alone do not show how they turn.
-const LED_BY_FEW: Bar = Bar {
-    why: "that of the row of every other Gaussian unseen, and the expected strain of 0.1 × the mean distance of the known: their \
-          turns are not passed on",
-    ..LED
 };
 
 /// What was found of the Gaussians of an extreme, by the origin of their motion.
@@ -63,8 +55,6 @@ pub(super) struct Verdict {
     strained: usize,
     /// Share of the Gaussians whose scale may change although the motion is rigid.
     may_strain: f64,
-    /// Departure of a follower from the rigid motion of those it follows, as a share of their distance.
-    may_depart: f64,
 }
 
 impl Verdict {
@@ -76,7 +66,6 @@ impl Verdict {
             origins: Origins::default(),
             strained: 0,
             may_strain: 0.0,
-            may_depart: 0.0,
         }
     }
 
@@ -104,8 +93,6 @@ impl Verdict {
         self.origins.add(other.origins);
         self.strained += other.strained;
         self.may_strain = self.may_strain.max(other.may_strain);
-        self.may_depart = self.may_depart.max(other.may_depart);
-        self.led.bar = other.led.bar;
         self
     }
 
@@ -113,12 +100,6 @@ impl Verdict {
     pub(super) fn straining(mut self, share: f64) -> Self {
         self.may_strain = self.may_strain.max(share);
         self
-    }
-
-    /// To be filled by so few known motions that followers may depart by the expected strain.
-    pub(super) fn expect_few(&mut self) {
-        self.may_depart = MotionSettings::default().neighbour_strain;
-        self.led.bar = LED_BY_FEW;
     }
 
     fn row(mut self) -> Row {
@@ -149,9 +130,7 @@ pub(super) fn table(verdicts: Vec<Verdict>) -> Vec<Row> {
     let mut rows = Vec::new();
     for verdict in verdicts {
         at_rest.absorb(&verdict.at_rest);
-        if verdict.may_depart == 0.0 {
-            led.absorb(&verdict.led);
-        }
+        led.absorb(&verdict.led);
         rows.push(verdict.row());
     }
     rows.extend([at_rest, led].into_iter().filter(|row| row.cases > 0));
@@ -353,8 +332,7 @@ fn judge(
             row.case(0.0, 0.0);
         }
         (MotionOrigin::Propagated, _) if demand != Demand::Solved => {
-            let (deviation, distance) = led_deviation(scene, field, index, settings).unwrap_or_default();
-            let predicted = deviation.hypot(verdict.may_depart * distance) + rounding;
+            let predicted = led_deviation(scene, field, index, settings).unwrap_or_default() + rounding;
             if error > LED.factor * predicted {
                 println!("{}: {error} behind its neighbours, predicted {predicted}", row.extreme);
             }

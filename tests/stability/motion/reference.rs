@@ -175,37 +175,29 @@ fn linearise(sights: &[Sight<'_>], at: DVec3) -> Option<(DMatrix<f64>, DVector<f
     Some((design, right))
 }
 
-/// Standard deviation of a mean that is found at rest, by the views that its displacement is least significant in, just
-/// more than half of all: a majority decides. Each errs by its share of the significance, which is what its tracks claim or
-/// the floor over the significance, and by their true deviation.
+/// Standard deviation of a mean that is found at rest. Each view errs by its share of the significance, which is what its
+/// tracks claim or the floor over the significance, and by their true deviation: where the footprint is found errs as well.
 pub(super) fn resting_deviation(sights: &[Sight<'_>], mean: DVec3, settings: &MotionSettings) -> f64 {
     let least = (settings.static_floor / settings.static_significance).powi(2);
-    let mut resting: Vec<(f64, Sight<'_>)> = sights
+    let resting: Vec<Sight<'_>> = sights
         .iter()
         .map(|sight| {
-            // Where the footprint is found errs as well.
             let deviation = sight.claimed_variance.max(least).sqrt() + sight.deviation;
-            let before = sight.camera.project_world(mean).unwrap_or(DVec2::INFINITY);
-            let variance = sight.claimed_variance.max(least);
-            let significance = before.distance_squared(sight.pixel) / variance;
-            (significance, Sight { assumed_variance: deviation * deviation, ..*sight })
+            Sight { assumed_variance: deviation * deviation, ..*sight }
         })
         .collect();
-    resting.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let majority: Vec<Sight<'_>> =
-        resting.iter().take(sights.len() / 2 + 1).map(|(_, sight)| *sight).collect();
-    covariances(&majority, mean).1.trace().sqrt()
+    covariances(&resting, mean).1.trace().sqrt()
 }
 
 /// Standard deviation of the position of Gaussian `index` by the rigid motion of the nearest ones of known motion, to first
 /// order: least squares of their displacements by the information that the shipped path may assume, with the turn free
-/// within its true size; and the mean distance of those. `None` if no motion is known.
+/// within its true size. `None` if no motion is known.
 pub(super) fn led_deviation(
     scene: &impl Tracked,
     field: &MotionField,
     index: usize,
     settings: &MotionSettings,
-) -> Option<(f64, f64)> {
+) -> Option<f64> {
     let (gaussians, motion) = (scene.gaussians(), scene.motion());
     let mean = gaussians.mean(index);
     let is_known =
@@ -217,8 +209,6 @@ pub(super) fn led_deviation(
     let size = gaussians.mean(*known.last()?).distance(mean).max(f64::MIN_POSITIVE);
     let unit = known.iter().find_map(|&other| position_covariance(scene, other, settings))?.trace();
     let mut normal = Matrix6::zeros();
-    let distance =
-        known.iter().map(|&other| gaussians.mean(other).distance(mean)).sum::<f64>() / known.len() as f64;
     for other in known {
         let Some(information) =
             position_covariance(scene, other, settings).and_then(|c| (c / unit).try_inverse())
@@ -236,7 +226,7 @@ pub(super) fn led_deviation(
         normal[(axis, axis)] += unit / (turn * turn);
     }
     let covariance = normal.try_inverse()?.fixed_view::<3, 3>(0, 0).trace() * unit;
-    covariance.is_finite().then(|| (covariance.sqrt(), distance))
+    covariance.is_finite().then(|| covariance.sqrt())
 }
 
 /// Covariance that the shipped path may assume of a position.
