@@ -139,7 +139,7 @@ pub(super) fn fit_rigid_motion(
     let information = system.rotation_information().unwrap_or_default();
     let kept = significant_share(turn.dot(information * turn), settings.rotation_significance);
     let left_out = turn * (1.0 - kept);
-    if left_out != DVec3::ZERO {
+    if kept < 1.0 {
         motion.rotation = DQuat::from_scaled_axis(turn * kept) * expectation.rotation;
     }
     motion.rotation_error = system.rotation_covariance() + outer(left_out, left_out);

@@ -42,6 +42,13 @@ const LED: Bar = Bar {
           least, its turn unknown to its true size; the bodies do not strain",
 };
 
+/// The same where so few are known that the nearest ones do not show how they turn, and are too noisy to turn on their own.
+const LED_BY_FEW: Bar = Bar {
+    why: "that of the row of every other Gaussian unseen, but only of those among the 12 nearest of all: motion is passed on \
+          from neighbour to neighbour",
+    ..LED
+};
+
 /// What was found of the Gaussians of an extreme, by the origin of their motion.
 #[derive(Clone, Debug)]
 pub(super) struct Verdict {
@@ -55,6 +62,8 @@ pub(super) struct Verdict {
     strained: usize,
     /// Share of the Gaussians whose scale may change although the motion is rigid.
     may_strain: f64,
+    /// Whether followers know those among their nearest neighbours only.
+    is_led_by_few: bool,
 }
 
 impl Verdict {
@@ -66,6 +75,7 @@ impl Verdict {
             origins: Origins::default(),
             strained: 0,
             may_strain: 0.0,
+            is_led_by_few: false,
         }
     }
 
@@ -93,6 +103,8 @@ impl Verdict {
         self.origins.add(other.origins);
         self.strained += other.strained;
         self.may_strain = self.may_strain.max(other.may_strain);
+        self.is_led_by_few |= other.is_led_by_few;
+        self.led.bar = other.led.bar;
         self
     }
 
@@ -100,6 +112,12 @@ impl Verdict {
     pub(super) fn straining(mut self, share: f64) -> Self {
         self.may_strain = self.may_strain.max(share);
         self
+    }
+
+    /// Followers know those among their nearest neighbours only.
+    pub(super) fn expect_few(&mut self) {
+        self.is_led_by_few = true;
+        self.led.bar = LED_BY_FEW;
     }
 
     fn row(mut self) -> Row {
@@ -130,7 +148,9 @@ pub(super) fn table(verdicts: Vec<Verdict>) -> Vec<Row> {
     let mut rows = Vec::new();
     for verdict in verdicts {
         at_rest.absorb(&verdict.at_rest);
-        led.absorb(&verdict.led);
+        if !verdict.is_led_by_few {
+            led.absorb(&verdict.led);
+        }
         rows.push(verdict.row());
     }
     rows.extend([at_rest, led].into_iter().filter(|row| row.cases > 0));
@@ -332,7 +352,9 @@ fn judge(
             row.case(0.0, 0.0);
         }
         (MotionOrigin::Propagated, _) if demand != Demand::Solved => {
-            let predicted = led_deviation(scene, field, index, settings).unwrap_or_default() + rounding;
+            let reach = if verdict.is_led_by_few { settings.neighbours } else { scene.gaussians().len() };
+            let predicted =
+                led_deviation(scene, field, index, reach, settings).unwrap_or_default() + rounding;
             if error > LED.factor * predicted {
                 println!("{}: {error} behind its neighbours, predicted {predicted}", row.extreme);
             }

@@ -189,6 +189,9 @@ const UNSEEN: [(&str, usize, f64); 4] = [
 
 fn followers((extreme, seen, noise): (&'static str, usize, f64)) -> Verdict {
     Verdict::of_seeds("motion: field", extreme, FIELD, 8, |verdict, seed| {
+        if seen > 2 && noise > 0.0 {
+            verdict.expect_few();
+        }
         let mut scene = body(Rig::USUAL, 25, seed);
         scene.noise = Noise::Independent(noise);
         for (index, opacity) in scene.gaussians.logit_opacities.iter_mut().enumerate() {

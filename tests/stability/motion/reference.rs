@@ -190,20 +190,23 @@ pub(super) fn resting_deviation(sights: &[Sight<'_>], mean: DVec3, settings: &Mo
 }
 
 /// Standard deviation of the position of Gaussian `index` by the rigid motion of the nearest ones of known motion, to first
-/// order: least squares of their displacements by the information that the shipped path may assume, with the turn free
+/// order, those among the `reach` nearest of all, or else the nearest: least squares of their displacements by the information that the shipped path may assume, with the turn free
 /// within its true size. `None` if no motion is known.
 pub(super) fn led_deviation(
     scene: &impl Tracked,
     field: &MotionField,
     index: usize,
+    reach: usize,
     settings: &MotionSettings,
 ) -> Option<f64> {
     let (gaussians, motion) = (scene.gaussians(), scene.motion());
     let mean = gaussians.mean(index);
     let is_known =
         |other: &usize| matches!(field.origin[*other], MotionOrigin::Solved | MotionOrigin::Static);
-    let mut known: Vec<usize> = (0..gaussians.len()).filter(is_known).collect();
-    known.sort_by(|&a, &b| gaussians.mean(a).distance(mean).total_cmp(&gaussians.mean(b).distance(mean)));
+    let mut others: Vec<usize> = (0..gaussians.len()).filter(|&other| other != index).collect();
+    others.sort_by(|&a, &b| gaussians.mean(a).distance(mean).total_cmp(&gaussians.mean(b).distance(mean)));
+    let near: Vec<usize> = others.iter().take(reach).copied().filter(is_known).collect();
+    let mut known = if near.is_empty() { others.into_iter().filter(is_known).collect() } else { near };
     known.truncate(settings.neighbours);
     // Units that make both halves of the unknowns alike.
     let size = gaussians.mean(*known.last()?).distance(mean).max(f64::MIN_POSITIVE);

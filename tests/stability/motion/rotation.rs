@@ -38,7 +38,7 @@ const EXACT_BESIDE: Bar = Bar { unit: "degrees", factor: 1.0, why: "0.05°, the 
 const EXACT_ALONE: Bar = Bar {
     unit: "degrees",
     factor: 2.0,
-    why: "shrinkage of a turn θ by its significance, 9 σ²/θ, where σ is that of discs whose points all lie 0.3 % off their \
+    why: "shrinkage of a turn θ by its significance, θ (9 σ²/θ²)², where σ is that of discs whose points all lie 0.3 % off their \
           surface on the same side, as is assumed of all; 0.025° at least: nothing errs",
 };
 
@@ -79,7 +79,8 @@ fn exact_pair(extreme: &'static str, rig: Rig, size: f64) -> [Row; 2] {
     // Points that all err alike are worth one.
     let alike = effective_samples(&body(rig, 1, 0).samples(0, &rig.cameras()[0], false));
     let shrunk = move |deviation: f64, turn: f64| {
-        (alike * (significance * deviation).powi(2) / turn).max(LEAST / EXACT_ALONE.factor)
+        let excess = alike * (significance * deviation / turn).powi(2);
+        (excess * excess * turn).max(LEAST / EXACT_ALONE.factor)
     };
     pair_of(extreme, rig, 0.0, size, (EXACT_ALONE, shrunk), (EXACT_BESIDE, |_, _| LEAST))
 }
