@@ -1,6 +1,6 @@
 //! What a device offers to the algorithms above it.
 //!
-//! One trait, two engines: the CPU engine in [`crate::raster`], later a GPU engine beside it. Static-model
+//! One trait, two engines: the CPU engine in [`crate::raster`], the GPU engine in the crate `splat-shaders`. Static-model
 //! reconstruction, motion compensation and refinement are written once, against this trait.
 
 use std::sync::Arc;
@@ -158,6 +158,16 @@ pub trait Session: Send {
 pub trait Engine: Send + Sync {
     /// Short name for reports, such as `cpu`.
     fn name(&self) -> &str;
+
+    /// The device and its driver, for people; `None` for the processor that runs this program.
+    fn device_name(&self) -> Option<&str> {
+        None
+    }
+
+    /// Whether the device is there to work. An engine that can come back to a lost device does so here.
+    fn check(&self) -> Result<(), EngineError> {
+        Ok(())
+    }
 
     /// Renders one view.
     fn render(
