@@ -230,6 +230,8 @@ impl GpuDevice {
         };
         let descriptor = DeviceDescriptor {
             label: Some("trackersplat"),
+            // For figures only: no kernel needs them.
+            required_features: adapter.features() & Features::TIMESTAMP_QUERY,
             required_limits: limits.clone(),
             ..Default::default()
         };

@@ -17,7 +17,8 @@ use crate::{
     device::GpuDevice,
     kernels::Kernels,
     layout::{GEOMETRY, State, Step, View},
-    program::record,
+    moments::footprint_moments,
+    program::{Dispatch, record},
     readback::read,
     session::GpuSession,
     stages::{Binder, ViewBuffer},
@@ -131,7 +132,18 @@ impl GpuEngine {
         &self,
         gaussians: &Gaussians,
         view: &ViewBuffer,
+        buffers: Buffers,
+    ) -> Result<Buffers, EngineError> {
+        self.run(gaussians, view, buffers, |binder, buffers, view| binder.forward(buffers, view))
+    }
+
+    /// Stages of a view, the lists among them, with more room until there is enough.
+    pub(crate) fn run(
+        &self,
+        gaussians: &Gaussians,
+        view: &ViewBuffer,
         mut buffers: Buffers,
+        stages: fn(&Binder<'_>, &Buffers, &ViewBuffer) -> Vec<Dispatch>,
     ) -> Result<Buffers, EngineError> {
         let Context { device, kernels } = &*self.context;
         loop {
@@ -146,7 +158,7 @@ impl GpuEngine {
             device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
             device.queue.write_buffer(&buffers.common.state, 0, bytes_of(&state));
             let mut encoder = device.device.create_command_encoder(&Default::default());
-            record(&mut encoder, "render", &Binder { device, kernels }.forward(&buffers, view));
+            record(&mut encoder, "render", &stages(&Binder { device, kernels }, &buffers, view));
             device.queue.submit([encoder.finish()]);
             let state: Vec<State> = read(device, &buffers.common.state, 1)?;
             if state[0].failed == 0 {
@@ -194,14 +206,12 @@ impl Engine for GpuEngine {
 
     fn footprint_moments(
         &self,
-        _gaussians: &Gaussians,
-        _camera: &Camera,
-        _tracks: &TrackField,
-        _reweighting: Option<&Reweighting>,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        tracks: &TrackField,
+        reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
-        Err(EngineError::InvalidInput(
-            "the GPU engine does not measure footprints; use the CPU engine for motion".to_owned(),
-        ))
+        footprint_moments(self, gaussians, camera, tracks, reweighting)
     }
 
     fn session(&self, input: SessionInput) -> Result<Box<dyn Session>, EngineError> {

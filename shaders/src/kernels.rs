@@ -24,6 +24,7 @@ pub(crate) const SOURCES: &[(&str, &str)] = &[
     ("blend", composed!("blend")),
     ("blend_backward", composed!("blend_backward")),
     ("project_backward", composed!("project_backward")),
+    ("footprint_moments", composed!("footprint_moments")),
     ("quantize", composed!("quantize")),
     ("loss", composed!("loss")),
     ("adam", composed!("adam")),
@@ -97,6 +98,7 @@ kernels! {
     "blend": blend;
     "blend_backward": blend_backward;
     "project_backward": project_backward;
+    "footprint_moments": footprint_moments, join_moments;
     "quantize": quantize;
     "loss": similarity, loss_gradient, total;
     "adam": adam_geometry, adam_sh;

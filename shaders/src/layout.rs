@@ -95,6 +95,28 @@ pub(crate) struct Density {
     pub visible_steps: u32,
 }
 
+/// Sums over a footprint's pixels, or means and central sums.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub(crate) struct Moments {
+    pub weights: [f32; 4],
+    pub first: [f32; 4],
+    pub second: [f32; 4],
+    pub cross: [f32; 4],
+    pub reference: [f32; 2],
+    pub anchor: u32,
+    pub pixels: f32,
+}
+
+/// By what a footprint's pixels are reweighted.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub(crate) struct Expectation {
+    pub displacement: [f32; 2],
+    pub fall: f32,
+    pub is_wanted: f32,
+}
+
 impl View {
     /// Without weights of a loss.
     pub(crate) fn new(camera: &Camera, background: [f32; 3]) -> Self {

@@ -17,7 +17,9 @@ mod device;
 mod engine;
 mod kernels;
 mod layout;
+mod moments;
 mod optimise;
+mod probe;
 mod program;
 mod readback;
 mod session;
@@ -30,3 +32,4 @@ pub use device::{
     DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, choose, devices, real_gpus,
 };
 pub use engine::GpuEngine;
+pub use probe::{Probe, Stage};

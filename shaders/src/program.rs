@@ -1,6 +1,6 @@
 //! A fixed list of dispatches, recorded again for every step.
 
-use wgpu::{BindGroup, Buffer, CommandEncoder, ComputePassDescriptor};
+use wgpu::{BindGroup, Buffer, CommandEncoder, ComputePassDescriptor, ComputePassTimestampWrites};
 
 use crate::kernels::Kernel;
 
@@ -41,8 +41,18 @@ pub(crate) fn record<'a>(
     label: &'static str,
     dispatches: impl IntoIterator<Item = &'a Dispatch>,
 ) {
+    record_timed(encoder, label, None, dispatches);
+}
+
+/// The same, with the times at which the pass begins and ends.
+pub(crate) fn record_timed<'a>(
+    encoder: &mut CommandEncoder,
+    label: &'static str,
+    timestamp_writes: Option<ComputePassTimestampWrites<'_>>,
+    dispatches: impl IntoIterator<Item = &'a Dispatch>,
+) {
     let mut pass =
-        encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(label), timestamp_writes: None });
+        encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(label), timestamp_writes });
     for dispatch in dispatches {
         pass.set_pipeline(&dispatch.kernel.pipeline);
         pass.set_bind_group(0, &dispatch.resources, &[]);

@@ -120,20 +120,29 @@ impl GpuSession {
         splat::gaussians::sh::coefficients(self.sh_degree)
     }
 
+    /// What a step on a view does: forward, loss, backward, optimiser.
+    pub(crate) fn stages(&self, binder: &Binder<'_>, view: usize) -> [Vec<Dispatch>; 4] {
+        let Self { buffers, gradients, optimiser, loss, .. } = self;
+        let SessionView { view, wanted, .. } = &self.views[view];
+        [
+            binder.forward(buffers, view),
+            binder.loss(buffers, gradients, loss, view, wanted).into(),
+            binder.backward(buffers, gradients, view).into(),
+            binder.adam(buffers, gradients, optimiser, self.coefficients() as u64).into(),
+        ]
+    }
+
+    /// The buffers of a view, and their first view.
+    pub(crate) fn first_view(&self) -> (&Buffers, &ViewBuffer) {
+        (&self.buffers, &self.views[0].view)
+    }
+
     /// Binds every view's program to the buffers as they are now, and clears the device's state.
     fn bind(&mut self) {
         let Context { device, kernels } = &*self.context;
         let binder = Binder { device, kernels };
-        let Self { buffers, gradients, optimiser, loss, .. } = &*self;
-        let coefficients = self.coefficients() as u64;
-        let programs = self.views.iter().map(|SessionView { view, wanted, .. }| {
-            let mut program = binder.forward(buffers, view);
-            program.extend(binder.loss(buffers, gradients, loss, view, wanted));
-            program.extend(binder.backward(buffers, gradients, view));
-            program.extend(binder.adam(buffers, gradients, optimiser, coefficients));
-            program
-        });
-        let programs: Vec<_> = programs.collect();
+        let programs: Vec<_> =
+            (0..self.views.len()).map(|view| self.stages(&binder, view).concat()).collect();
         for (view, program) in self.views.iter_mut().zip(programs) {
             view.program = program;
         }

@@ -7,7 +7,7 @@ use wgpu::{BindingResource, Buffer};
 use crate::{
     buffers::{
         BLOCK, Buffers, CommonBuffers, DEPTH_PASSES, DIGITS, GradientBuffers, IntersectionBuffers,
-        SortBuffers, allocate, uniform,
+        MomentBuffers, SortBuffers, allocate, uniform,
     },
     device::GpuDevice,
     kernels::{Kernel, Kernels},
@@ -53,10 +53,50 @@ impl Binder<'_> {
 
     /// Stages 1 to 3.
     pub(crate) fn forward(&self, buffers: &Buffers, view: &ViewBuffer) -> Vec<Dispatch> {
-        let mut program = vec![self.project(buffers, view)];
-        self.bin(buffers, view, &mut program);
+        let mut program = self.lists(buffers, view);
         program.push(self.blend(buffers, view));
         program
+    }
+
+    /// Stages 1 and 2.
+    pub(crate) fn lists(&self, buffers: &Buffers, view: &ViewBuffer) -> Vec<Dispatch> {
+        let mut program = vec![self.project(buffers, view)];
+        self.bin(buffers, view, &mut program);
+        program
+    }
+
+    /// Moments of `wanted` footprints, after the lists of a view.
+    pub(crate) fn footprint_moments(
+        &self,
+        buffers: &Buffers,
+        tracks: &MomentBuffers,
+        view: &ViewBuffer,
+        wanted: u64,
+    ) -> [Dispatch; 2] {
+        let Buffers { footprints, intersections, images, .. } = buffers;
+        let of_tiles = [
+            (0, whole(&view.buffer)),
+            (1, whole(&images.bounds)),
+            (2, whole(sorted_slots(intersections, &view.data))),
+            (3, whole(&intersections.owners)),
+            (4, whole(&footprints.footprints)),
+            (5, whole(&tracks.expectations)),
+            (6, whole(&tracks.positions)),
+            (7, whole(&tracks.sigmas)),
+            (8, whole(&tracks.sums)),
+        ];
+        let joined = [
+            (0, whole(&view.buffer)),
+            (9, whole(&footprints.ranges)),
+            (10, whole(&tracks.wanted)),
+            (11, whole(&tracks.sums)),
+            (12, whole(&tracks.moments)),
+        ];
+        let tiles = Groups::of(view.data.tile_count().into());
+        [
+            self.dispatch(&self.kernels.footprint_moments, tiles, &of_tiles),
+            self.dispatch(&self.kernels.join_moments, Groups::threads(wanted), &joined),
+        ]
     }
 
     /// What is rendered as 8-bit RGB.

@@ -1,6 +1,6 @@
 //! What a device offers to the algorithms above it.
 //!
-//! One trait, two engines: the CPU engine in [`crate::raster`], the GPU engine in the crate `splat-shaders`. Static-model
+//! One trait, two engines: the CPU engine in [`crate::raster`], and the GPU engine of `splat-shaders`. Static-model
 //! reconstruction, motion compensation and refinement are written once, against this trait.
 
 use std::sync::Arc;
@@ -115,6 +115,21 @@ pub fn check_size(camera: &Camera) -> Result<(), EngineError> {
         return Err(EngineError::InvalidInput(format!("a camera of {width}x{height} pixels; it needs one")));
     }
     Ok(())
+}
+
+/// Whether a track field has the camera's size.
+pub fn check_tracks(camera: &Camera, tracks: &TrackField) -> Result<(), EngineError> {
+    let pixels = camera.width as usize * camera.height as usize;
+    let fits = tracks.width == camera.width
+        && tracks.height == camera.height
+        && [tracks.positions.len(), tracks.visible.len(), tracks.sigma.len()] == [pixels; 3];
+    if fits {
+        return Ok(());
+    }
+    Err(EngineError::InvalidInput(format!(
+        "a track field of {}x{} for a camera of {}x{}; give tracks of the camera's size",
+        tracks.width, tracks.height, camera.width, camera.height
+    )))
 }
 
 /// Per-Gaussian statistics that densification decides by, summed since they were last taken.

@@ -97,7 +97,7 @@ pub(crate) fn build(name: &str) -> Result<PathBuf> {
 }
 
 /// The executable of target `name` among cargo's messages, one JSON object per line.
-fn executable(messages: &str, name: &str) -> Option<PathBuf> {
+pub(crate) fn executable(messages: &str, name: &str) -> Option<PathBuf> {
     messages.lines().find_map(|line| {
         let message: Value = serde_json::from_str(line).ok()?;
         if message["target"]["name"] != name {

@@ -1,8 +1,10 @@
-//! Developer commands: `cargo xtask test`, `cargo xtask lint`, `cargo xtask bench`, `cargo xtask numerics`.
+//! Developer commands: `cargo xtask test`, `cargo xtask lint`, `cargo xtask bench`, `cargo xtask numerics`,
+//! `cargo xtask gpu-check`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
 
 mod bench;
 mod cargo;
+mod gpu_check;
 mod instructions;
 mod numerics;
 mod prerequisites;
@@ -27,6 +29,8 @@ enum Command {
     Bench(bench::Bench),
     /// Every stage at its extremes: runs the suite and renews the tables of docs/numerics.md.
     Numerics,
+    /// Pack one folder that checks and times the GPU engine on a machine without Rust.
+    GpuCheck(gpu_check::GpuCheck),
 }
 
 fn main() -> anyhow::Result<()> {
@@ -39,6 +43,7 @@ fn main() -> anyhow::Result<()> {
         Command::Lint => lint(),
         Command::Bench(bench) => bench.run(),
         Command::Numerics => numerics::run(),
+        Command::GpuCheck(check) => check.run(),
     }
 }
 

@@ -1,6 +1,7 @@
 //! The buffers of a device: what a pass and a training session take, known before it is taken.
 
 mod common;
+mod moments;
 pub(crate) mod parameters;
 mod raster;
 mod training;
@@ -10,6 +11,7 @@ use wgpu::{Buffer, BufferDescriptor, BufferUsages, ErrorFilter};
 
 pub(crate) use self::{
     common::{CommonBuffers, DEPTH_PASSES},
+    moments::MomentBuffers,
     parameters::{ParameterBuffers, separated},
     raster::{Buffers, DIGITS, FootprintBuffers, IntersectionBuffers, SortBuffers, first_capacity},
     training::{GradientBuffers, LossBuffers, OptimiserBuffers, training_image, training_requests},

@@ -10,7 +10,10 @@ use splat::raster;
 
 use crate::{
     kernels::SOURCES,
-    layout::{Density, GEOMETRY, ReplaceSettings, SUMS, ScanSettings, SortSettings, State, Step, TILE, View},
+    layout::{
+        Density, Expectation, GEOMETRY, Moments, ReplaceSettings, SUMS, ScanSettings, SortSettings, State,
+        Step, TILE, View,
+    },
 };
 
 fn modules() -> Vec<(&'static str, Module)> {
@@ -94,6 +97,8 @@ fn host_structs_lie_in_memory_as_the_shaders_read_them() {
         layout_of!(ScanSettings { list }),
         layout_of!(ReplaceSettings { count, width }),
         layout_of!(Density { gradient_norm, visible_steps }),
+        layout_of!(Moments { weights, first, second, cross, reference, anchor, pixels }),
+        layout_of!(Expectation { displacement, fall, is_wanted }),
     ]);
     let found = structs();
     for (name, layout) in &expected {
@@ -117,6 +122,9 @@ fn constants_are_those_of_the_cpu_engine() {
         ("TILE", TILE.into()),
         ("GEOMETRY", GEOMETRY as f64),
         ("SUMS", SUMS as f64),
+        ("SIGMA_MIN", raster::SIGMA_MIN.into()),
+        ("SIGMA_MAX", raster::SIGMA_MAX.into()),
+        ("FARTHEST", raster::FARTHEST),
         ("LN_OF_255", -f64::from(raster::ALPHA_MIN).ln()),
     ]);
     let mut seen = BTreeMap::new();

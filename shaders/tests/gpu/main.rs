@@ -7,6 +7,7 @@
 
 mod algorithms;
 mod golden;
+mod moments;
 mod scenes;
 mod session;
 mod support;

@@ -6,6 +6,8 @@
 //! expected motion is a translation even where the final fit is affine, as an affine map explains a step between two
 //! surfaces too well to let go of either.
 
+use rayon::prelude::*;
+
 use super::moments::{Displacements, FootprintMoments};
 
 /// Residual power of the affine fit over that of the track noise from which a footprint is fitted again: half as much
@@ -54,6 +56,30 @@ impl Reweighting {
             displacement: displacements.mean.to_array(),
             inverse_scale_squared: scale_squared.recip(),
         })
+    }
+
+    /// The passes after the first, on one view's `moments`. `measure` sums the footprints of the given Gaussians again, in their
+    /// order, each pixel's weight times the share that its residual leaves.
+    pub fn apply<E>(
+        &self,
+        moments: &mut [FootprintMoments],
+        mut measure: impl FnMut(&[(u32, ExpectedMotion)]) -> Result<Vec<FootprintMoments>, E>,
+    ) -> Result<(), E> {
+        let mut wanted: Vec<u32> = (0..moments.len() as u32).collect();
+        for _ in 0..self.passes {
+            let expect = |index: u32| Some((index, self.expected(&moments[index as usize])?));
+            let expected: Vec<(u32, ExpectedMotion)> = wanted.into_par_iter().filter_map(expect).collect();
+            if expected.is_empty() {
+                break;
+            }
+            let reweighted = measure(&expected)?;
+            // What stands once, stands.
+            wanted = expected.into_iter().map(|(index, _)| index).collect();
+            for (&index, reweighted) in wanted.iter().zip(reweighted) {
+                moments[index as usize].reweigh(reweighted);
+            }
+        }
+        Ok(())
     }
 }
 

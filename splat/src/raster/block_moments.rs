@@ -7,6 +7,7 @@
 //! in double precision.
 
 use super::{
+    FARTHEST, SIGMA_MAX, SIGMA_MIN,
     blend::{BATCH, Open},
     blocks::{BLOCK, BLOCKS, BandView, Listed, TILE, TileLists, corner},
     tile::{Offsets, Tile},
@@ -16,12 +17,6 @@ use crate::{
     simd::{Group, LANES, ROWS, Simd, prefetch, simd_kernel},
     tracking::TrackField,
 };
-
-/// Standard deviations, px, outside of which a claim is taken for this one: squares of its inverse stay within single
-/// precision.
-const SIGMA: [f32; 2] = [1e-6, 1e6];
-/// Displacement, px, beyond which a track is no track.
-const FARTHEST: f64 = 65_536.0;
 
 /// A pixel's features, in the order of the columns of [`BlockTracks::features`] and of [`Sums`]: with `r` the inverse
 /// variance of its track, `u, v` its position and `a, b` its displacement.
@@ -144,7 +139,7 @@ impl BlockTracks {
             let is_near = displacement[0].abs() <= FARTHEST && displacement[1].abs() <= FARTHEST;
             // Comparisons with NaN are false.
             if tracks.visible[pixel] && sigma > 0.0 && sigma < f32::INFINITY && is_near {
-                self.precision[lane] = sigma.clamp(SIGMA[0], SIGMA[1]).powi(2).recip();
+                self.precision[lane] = sigma.clamp(SIGMA_MIN, SIGMA_MAX).powi(2).recip();
                 usable[count] = (lane, displacement);
                 count += 1;
             }

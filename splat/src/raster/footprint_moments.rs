@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     cameras::Camera,
-    engine::EngineError,
+    engine::{EngineError, check_tracks},
     gaussians::Gaussians,
     motion::{
         moments::FootprintMoments,
@@ -35,7 +35,7 @@ pub(super) fn footprint_moments(
     tracks: &TrackField,
     reweighting: Option<&Reweighting>,
 ) -> Result<Vec<FootprintMoments>, EngineError> {
-    check(camera, tracks)?;
+    check_tracks(camera, tracks)?;
     let mut bins = Bins::default();
     project(instructions, gaussians, camera, 0, &mut bins.projection);
     bins.sort(camera.height, &mut Vec::new());
@@ -45,36 +45,12 @@ pub(super) fn footprint_moments(
     let mut moments: Vec<FootprintMoments> =
         (0..count).into_par_iter().map(|index| centred(&view.total(&of_bands, index))).collect();
     drop(of_bands);
-    let Some(reweighting) = reweighting else { return Ok(moments) };
-    let expect = |index: u32| Some((index, reweighting.expected(&moments[index as usize])?));
-    let mut expected: Vec<(u32, ExpectedMotion)> =
-        (0..count as u32).into_par_iter().filter_map(expect).collect();
-    for _ in 0..reweighting.passes {
-        if expected.is_empty() {
-            break;
-        }
-        for (index, sums) in view.reweighted_sums(count, &expected) {
-            moments[index].reweigh(centred(&sums));
-        }
-        // What stands once, stands.
-        let expect = |index: u32| Some((index, reweighting.expected(&moments[index as usize])?));
-        expected = expected.into_par_iter().filter_map(|(index, _)| expect(index)).collect();
+    if let Some(reweighting) = reweighting {
+        reweighting.apply(&mut moments, |expected| {
+            Ok::<_, EngineError>(view.reweighted_sums(count, expected).iter().map(centred).collect())
+        })?;
     }
     Ok(moments)
-}
-
-fn check(camera: &Camera, tracks: &TrackField) -> Result<(), EngineError> {
-    let pixels = camera.width as usize * camera.height as usize;
-    let fits = tracks.width == camera.width
-        && tracks.height == camera.height
-        && [tracks.positions.len(), tracks.visible.len(), tracks.sigma.len()] == [pixels; 3];
-    if fits {
-        return Ok(());
-    }
-    Err(EngineError::InvalidInput(format!(
-        "a track field of {}x{} for a camera of {}x{}; give tracks of the camera's size",
-        tracks.width, tracks.height, camera.width, camera.height
-    )))
 }
 
 /// What all passes over a view share.
@@ -103,7 +79,7 @@ impl View<'_> {
     }
 
     /// The sums of the Gaussians, of `count`, whose pixels are reweighted by an expected motion; in their order.
-    fn reweighted_sums(&self, count: usize, expected: &[(u32, ExpectedMotion)]) -> Vec<(usize, Sums)> {
+    fn reweighted_sums(&self, count: usize, expected: &[(u32, ExpectedMotion)]) -> Vec<Sums> {
         let mut expectation_of = vec![NONE; count];
         for (number, (index, _)) in expected.iter().enumerate() {
             expectation_of[*index as usize] = number as u32;
@@ -127,11 +103,10 @@ impl View<'_> {
         };
         let of_bands: Vec<(Vec<usize>, Vec<Sums>)> =
             (0..self.bins.bands()).into_par_iter().map_init(Scratch::default, of_band).collect();
-        let mut totals: Vec<(usize, Sums)> =
-            expected.iter().map(|(index, _)| (*index as usize, ZERO)).collect();
+        let mut totals = vec![ZERO; expected.len()];
         for (numbers, sums) in &of_bands {
             for (&number, sums) in numbers.iter().zip(sums) {
-                add(&mut totals[number].1, sums);
+                add(&mut totals[number], sums);
             }
         }
         totals

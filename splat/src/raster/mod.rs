@@ -55,3 +55,13 @@ pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 
 /// The slope of the local affine projection is held at the image border plus this share of the half field of view.
 pub const FRUSTUM_MARGIN: f64 = 0.3;
+
+/// Least standard deviation of a track, pixels: smaller claims are taken for this one, so that squares of its inverse stay
+/// within single precision.
+pub const SIGMA_MIN: f32 = 1e-6;
+
+/// Largest one, likewise.
+pub const SIGMA_MAX: f32 = 1e6;
+
+/// Displacement per axis, pixels, beyond which a track is no track.
+pub const FARTHEST: f64 = 65_536.0;

@@ -1,0 +1,114 @@
+//! Whether the GPU engine is right on this machine's device, and how fast: `cargo xtask gpu-check` packs it for machines
+//! without Rust.
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
+
+mod benchmark;
+mod parity;
+mod report;
+#[path = "../../../splat/benches/scene/mod.rs"]
+mod scene;
+mod tracks;
+
+use std::{fs, path::PathBuf, process::ExitCode};
+
+use anyhow::{Context, Result};
+use clap::Parser;
+use splat_shaders::{DeviceChoice, GpuDevice, GpuEngine, devices};
+
+use self::{
+    benchmark::{Row, Source},
+    report::{Adapter, Report},
+    scene::SceneSize,
+};
+
+/// Checks the GPU engine against the CPU engine on this machine's device, then times its stages. Exit code 1: a check
+/// failed; 2: it could not run.
+#[derive(Parser)]
+struct Arguments {
+    /// `auto`, `gpu:N`, or a part of a device's name; `auto` takes software where there is no GPU.
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// 10 000 Gaussians in 640×360 only, few repeats.
+    #[arg(long)]
+    quick: bool,
+    /// Leave larger scenes out.
+    #[arg(long, value_name = "N", default_value_t = 1_000_000)]
+    max_gaussians: usize,
+    /// Checks only.
+    #[arg(long)]
+    no_benchmark: bool,
+    /// Time this scene file (npz) instead of generated scenes; may be given several times.
+    #[arg(long, value_name = "FILE.npz")]
+    scene: Vec<PathBuf>,
+    /// Also write everything as JSON.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(1),
+        Err(error) => {
+            eprintln!("{error:#}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Whether every check passed.
+fn run(arguments: &Arguments) -> Result<bool> {
+    let engine = GpuEngine::new(open(&arguments.device)?).context("the kernels")?;
+    let adapter = Adapter::new(engine.device().description());
+    println!("{adapter}\n");
+    let checks = parity::run(&engine)?;
+    let mut report =
+        Report { version: env!("CARGO_PKG_VERSION"), adapter, checks, rows: Vec::new(), refinement: None };
+    println!();
+    if !arguments.no_benchmark {
+        for source in sources(arguments) {
+            let row = Row::measure(&engine, source, arguments.quick)?;
+            println!("{row}");
+            report.rows.push(row);
+        }
+        let refinement = benchmark::refinement(&engine, arguments.quick, arguments.max_gaussians)?;
+        println!("\n{refinement}");
+        report.checks.push(refinement.check());
+        report.refinement = Some(refinement);
+    }
+    if let Some(path) = &arguments.json {
+        let text = serde_json::to_string_pretty(&report)?;
+        fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    let failed = report.checks.iter().filter(|check| !check.passed()).count();
+    println!("\n{} checks, {failed} failed", report.checks.len());
+    Ok(failed == 0)
+}
+
+fn open(device: &str) -> Result<GpuDevice> {
+    let choice = match device.strip_prefix("gpu:").and_then(|number| number.parse().ok()) {
+        Some(index) => DeviceChoice::Index(index),
+        None if device != "auto" => DeviceChoice::Name(device.to_owned()),
+        None => match GpuDevice::open(&DeviceChoice::Auto) {
+            Ok(device) => return Ok(device),
+            // Software if there is any; else the error says what is there.
+            Err(_) => devices().first().map_or(DeviceChoice::Auto, |first| DeviceChoice::Index(first.index)),
+        },
+    };
+    Ok(GpuDevice::open(&choice)?)
+}
+
+fn sources(arguments: &Arguments) -> Vec<Source> {
+    if !arguments.scene.is_empty() {
+        return arguments.scene.iter().cloned().map(Source::File).collect();
+    }
+    let all = [10_000, 100_000, 1_000_000].into_iter().flat_map(|gaussians| {
+        [(640, 360), (1280, 720), (1920, 1080)].into_iter().flat_map(move |(width, height)| {
+            [0, 3].map(|sh_degree| SceneSize { gaussians, width, height, sh_degree })
+        })
+    });
+    let is_quick = |size: &SceneSize| size.gaussians == 10_000 && size.width == 640;
+    all.filter(|size| size.gaussians <= arguments.max_gaussians && (!arguments.quick || is_quick(size)))
+        .map(Source::Size)
+        .collect()
+}
