@@ -222,7 +222,12 @@ pub(crate) struct WorkerSetup {
 impl EngineArgs {
     /// The engine, if this machine can run it.
     pub(crate) fn engine(&self) -> Result<Arc<dyn Engine>, CliError> {
-        match self.placement()? {
+        self.engine_on(&self.placement()?)
+    }
+
+    /// The engine on one of these devices, the best.
+    pub(crate) fn engine_on(&self, placement: &Placement) -> Result<Arc<dyn Engine>, CliError> {
+        match placement {
             // The best comes first.
             Placement::Gpus(gpus) => gpu_engine(gpus.first().copied().unwrap_or_default()),
             Placement::Cpu => Ok(Arc::new(self.cpu_engine()?)),
@@ -232,15 +237,6 @@ impl EngineArgs {
     /// Worker processes for this machine: `asked` of them, else one per GPU, else `on_cpu` of one thread each. Each owns one
     /// device; the `cores` are divided among those that own a GPU.
     pub(crate) fn workers(
-        &self,
-        asked: Option<usize>,
-        on_cpu: usize,
-        cores: usize,
-    ) -> Result<Vec<WorkerSetup>, CliError> {
-        Ok(self.divided(&self.placement()?, asked, on_cpu, cores))
-    }
-
-    fn divided(
         &self,
         placement: &Placement,
         asked: Option<usize>,
@@ -264,7 +260,8 @@ impl EngineArgs {
         }
     }
 
-    fn placement(&self) -> Result<Placement, CliError> {
+    /// The devices that are meant, on this machine.
+    pub(crate) fn placement(&self) -> Result<Placement, CliError> {
         match (&self.instructions, &self.device) {
             (Some(_), DeviceArg::Auto) => Ok(Placement::Cpu),
             (Some(set), DeviceArg::Gpu | DeviceArg::One(_)) => Err(CliError::bad_input(
@@ -360,17 +357,17 @@ mod tests {
     fn a_host_has_a_worker_per_gpu_or_as_many_as_asked_for() {
         let args = EngineArgs::default();
         let gpus = Placement::Gpus(vec![2, 0]);
-        let by_default = args.divided(&gpus, None, 16, 16);
+        let by_default = args.workers(&gpus, None, 16, 16);
         assert_eq!(arguments(&by_default), ["--device=gpu:2", "--device=gpu:0"]);
         assert_eq!(by_default[0].threads, 8);
-        let three = args.divided(&gpus, Some(3), 16, 2);
+        let three = args.workers(&gpus, Some(3), 16, 2);
         assert_eq!(arguments(&three), ["--device=gpu:2", "--device=gpu:0", "--device=gpu:2"]);
         assert_eq!(three[0].threads, 1);
-        assert!(args.divided(&gpus, Some(0), 16, 16).is_empty());
-        let cpu = args.divided(&Placement::Cpu, None, 3, 16);
+        assert!(args.workers(&gpus, Some(0), 16, 16).is_empty());
+        let cpu = args.workers(&Placement::Cpu, None, 3, 16);
         assert_eq!(arguments(&cpu), ["--device=cpu"; 3]);
         assert_eq!(cpu[0].threads, 1);
-        assert_eq!(args.divided(&Placement::Cpu, Some(5), 3, 16).len(), 5);
+        assert_eq!(args.workers(&Placement::Cpu, Some(5), 3, 16).len(), 5);
     }
 
     #[test]
@@ -380,7 +377,7 @@ mod tests {
         for device in [DeviceArg::Auto, DeviceArg::Cpu] {
             let args = baseline(device);
             assert_eq!(args.engine().unwrap().name(), "cpu");
-            let workers = args.workers(Some(1), 1, 1).unwrap();
+            let workers = args.workers(&args.placement().unwrap(), Some(1), 1, 1);
             assert_eq!(workers[0].arguments, ["--device=cpu", "--instructions=baseline"]);
         }
         let refused = baseline(DeviceArg::Gpu).engine().err().unwrap();

@@ -41,7 +41,7 @@ pub struct DeviceDescription {
     pub backend: String,
     /// Driver and its version.
     pub driver: String,
-    /// Memory that jobs can have, bytes, where the driver says: a card's own, for other devices the largest they see.
+    /// Memory that jobs can have, bytes, where the driver says: a card's own, else the largest it sees. Unknown for software.
     pub memory: Option<u64>,
     /// Largest buffer that a kernel can see, bytes.
     pub max_binding: u64,
@@ -157,6 +157,10 @@ impl DeviceDescription {
 #[cfg(not(target_vendor = "apple"))]
 fn memory(adapter: &Adapter, kind: DeviceKind) -> Option<u64> {
     const DEVICE_LOCAL: u32 = 1;
+    if kind == DeviceKind::Software {
+        // What such drivers say is a constant of theirs; they use the memory of the host.
+        return None;
+    }
     // SAFETY: the handles are only asked for properties, and nothing of them outlives the adapter.
     let memory = unsafe {
         let adapter = adapter.as_hal::<wgpu::hal::api::Vulkan>()?;

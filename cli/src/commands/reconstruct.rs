@@ -67,8 +67,9 @@ pub(super) async fn reconstruct(
     logs: &LogArgs,
 ) -> Result<(), CliError> {
     let interrupted = interrupt::token()?;
-    let workers = run.engine.workers(run.workers, on_cpu, cores())?;
-    let engine = run.engine.engine()?;
+    let placement = run.engine.placement()?;
+    let workers = run.engine.workers(&placement, run.workers, on_cpu, cores());
+    let engine = run.engine.engine_on(&placement)?;
     let embedded = EmbeddedRun { output, request, workers, listen: run.listen, engine, logs };
     let outcome = embedded.run(&interrupted).await.map_err(|error| with_remedy(error, output))?;
     if run.json {
