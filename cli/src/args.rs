@@ -1,9 +1,13 @@
 //! Options that several commands share.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
 use clap::{Args, ValueEnum};
 use splat::{
+    engine::Engine,
     motion::LiftMethod,
     raster::CpuEngine,
     settings::{MotionSource, Quality},
@@ -11,7 +15,12 @@ use splat::{
 };
 use trackersplat_proto::v1::{ExactTracks, SubmitRequest, TrackFiles, submit_request::Tracks};
 
-use crate::{error::CliError, frame_range::FrameRange, layers::SettingsLayers};
+use crate::{
+    device::{DeviceArg, Placement, gpu_engine},
+    error::CliError,
+    frame_range::FrameRange,
+    layers::SettingsLayers,
+};
 
 /// Where the pieces that run by hand find each other by default.
 pub(crate) const DEFAULT_COORDINATOR: &str = "http://127.0.0.1:7700";
@@ -184,23 +193,86 @@ impl JobArgs {
 }
 
 /// How this machine computes.
-#[derive(Args, Clone, Copy, Debug, Default)]
+#[derive(Args, Clone, Debug, Default)]
 pub(crate) struct EngineArgs {
+    /// What computes: a GPU by its number or by a part of its name, as `trackersplat devices` lists them, or the processor.
+    ///
+    /// `auto` is the best GPU, or the processor where there is none; `gpu` is the best GPU or an error. Neither takes software
+    /// that behaves like a GPU, which must be named. Results of different devices differ by rounding.
+    #[arg(long, value_name = "auto|cpu|gpu|gpu:N|NAME", default_value_t, help_heading = "Execution")]
+    pub(crate) device: DeviceArg,
+
     /// Instruction set of the processor [default: the widest; possible values: avx512, avx2, baseline].
     ///
-    /// avx512 and avx2 give the same bytes, baseline others, by rounding.
+    /// avx512 and avx2 give the same bytes, baseline others, by rounding. Asks for the processor: with it, `--device auto` is
+    /// `--device cpu`.
     #[arg(long, value_name = "SET", help_heading = "Execution")]
     pub(crate) instructions: Option<InstructionSet>,
 }
 
+/// One worker process.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct WorkerSetup {
+    /// Threads for what runs on the processor.
+    pub(crate) threads: usize,
+    /// Its device, as the arguments of `worker` that say so.
+    pub(crate) arguments: Vec<String>,
+}
+
 impl EngineArgs {
-    /// The same for another command.
-    pub(crate) fn to_arguments(self) -> Vec<String> {
-        self.instructions.map(|set| format!("--instructions={set}")).into_iter().collect()
+    /// The engine, if this machine can run it.
+    pub(crate) fn engine(&self) -> Result<Arc<dyn Engine>, CliError> {
+        self.engine_on(&self.placement()?)
     }
 
-    /// The engine, if this machine can run it.
-    pub(crate) fn engine(self) -> Result<CpuEngine, CliError> {
+    /// The engine on one of these devices, the best.
+    pub(crate) fn engine_on(&self, placement: &Placement) -> Result<Arc<dyn Engine>, CliError> {
+        match placement {
+            // The best comes first.
+            Placement::Gpus(gpus) => gpu_engine(gpus.first().copied().unwrap_or_default()),
+            Placement::Cpu => Ok(Arc::new(self.cpu_engine()?)),
+        }
+    }
+
+    /// Worker processes for this machine: `asked` of them, else one per GPU, else `on_cpu` of one thread each. Each owns one
+    /// device; the `cores` are divided among those that own a GPU.
+    pub(crate) fn workers(
+        &self,
+        placement: &Placement,
+        asked: Option<usize>,
+        on_cpu: usize,
+        cores: usize,
+    ) -> Vec<WorkerSetup> {
+        let instructions = self.instructions.map(|set| format!("--instructions={set}"));
+        match placement {
+            Placement::Cpu => {
+                let arguments = ["--device=cpu".to_owned()].into_iter().chain(instructions).collect();
+                vec![WorkerSetup { threads: 1, arguments }; asked.unwrap_or(on_cpu)]
+            }
+            Placement::Gpus(gpus) => {
+                let count = asked.unwrap_or(gpus.len());
+                let one = |gpu: &usize| WorkerSetup {
+                    threads: (cores / count).max(1),
+                    arguments: vec![format!("--device=gpu:{gpu}")],
+                };
+                gpus.iter().cycle().take(count).map(one).collect()
+            }
+        }
+    }
+
+    /// The devices that are meant, on this machine.
+    pub(crate) fn placement(&self) -> Result<Placement, CliError> {
+        match (&self.instructions, &self.device) {
+            (Some(_), DeviceArg::Auto) => Ok(Placement::Cpu),
+            (Some(set), DeviceArg::Gpu | DeviceArg::One(_)) => Err(CliError::bad_input(
+                format!("--instructions {set}"),
+                format!("a GPU has no such instructions; leave it out, or --device {}", self.device),
+            )),
+            (_, device) => device.placement(),
+        }
+    }
+
+    fn cpu_engine(&self) -> Result<CpuEngine, CliError> {
         let Some(set) = self.instructions else { return Ok(CpuEngine::default()) };
         let instructions = Instructions::require(set)
             .map_err(|error| CliError::bad_input(format!("--instructions {set}"), error))?;
@@ -275,6 +347,42 @@ mod tests {
         let settings: splat::settings::Settings = serde_json::from_str(&request.settings_json).unwrap();
         assert_eq!((settings.seed, settings.motion_source), (9, MotionSource::None));
         assert_eq!(settings.motion.lift, LiftMethod::Reference);
+    }
+
+    fn arguments(setups: &[WorkerSetup]) -> Vec<&str> {
+        setups.iter().map(|setup| setup.arguments[0].as_str()).collect()
+    }
+
+    #[test]
+    fn a_host_has_a_worker_per_gpu_or_as_many_as_asked_for() {
+        let args = EngineArgs::default();
+        let gpus = Placement::Gpus(vec![2, 0]);
+        let by_default = args.workers(&gpus, None, 16, 16);
+        assert_eq!(arguments(&by_default), ["--device=gpu:2", "--device=gpu:0"]);
+        assert_eq!(by_default[0].threads, 8);
+        let three = args.workers(&gpus, Some(3), 16, 2);
+        assert_eq!(arguments(&three), ["--device=gpu:2", "--device=gpu:0", "--device=gpu:2"]);
+        assert_eq!(three[0].threads, 1);
+        assert!(args.workers(&gpus, Some(0), 16, 16).is_empty());
+        let cpu = args.workers(&Placement::Cpu, None, 3, 16);
+        assert_eq!(arguments(&cpu), ["--device=cpu"; 3]);
+        assert_eq!(cpu[0].threads, 1);
+        assert_eq!(args.workers(&Placement::Cpu, Some(5), 3, 16).len(), 5);
+    }
+
+    #[test]
+    fn instructions_are_the_processors() {
+        let baseline =
+            |device: DeviceArg| EngineArgs { device, instructions: Some(InstructionSet::Baseline) };
+        for device in [DeviceArg::Auto, DeviceArg::Cpu] {
+            let args = baseline(device);
+            assert_eq!(args.engine().unwrap().name(), "cpu");
+            let workers = args.workers(&args.placement().unwrap(), Some(1), 1, 1);
+            assert_eq!(workers[0].arguments, ["--device=cpu", "--instructions=baseline"]);
+        }
+        let refused = baseline(DeviceArg::Gpu).engine().err().unwrap();
+        assert_eq!(refused.exit_code(), 3);
+        assert!(refused.to_string().contains("--instructions baseline"), "{refused}");
     }
 
     #[test]

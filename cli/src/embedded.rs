@@ -2,6 +2,7 @@
 
 use std::{net::SocketAddr, path::Path, sync::Arc, time::Duration};
 
+use splat::engine::Engine;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
@@ -9,7 +10,7 @@ use trackersplat_coordinator::{Running, ServeOptions, serve};
 use trackersplat_proto::v1::{JobState, ListRequest, SubmitRequest, jobs_client::JobsClient};
 
 use crate::{
-    args::EngineArgs,
+    args::WorkerSetup,
     client, display, environment,
     error::CliError,
     follow::follow,
@@ -28,10 +29,11 @@ const FAREWELL: Duration = Duration::from_secs(3);
 pub(crate) struct EmbeddedRun<'a> {
     pub(crate) output: &'a Path,
     pub(crate) request: SubmitRequest,
-    /// Worker processes to start; 0 waits for workers that are started by hand.
-    pub(crate) workers: usize,
+    /// Worker processes to start; none waits for workers that are started by hand.
+    pub(crate) workers: Vec<WorkerSetup>,
     pub(crate) listen: SocketAddr,
-    pub(crate) engine: EngineArgs,
+    /// The coordinator's own.
+    pub(crate) engine: Arc<dyn Engine>,
     pub(crate) logs: &'a LogArgs,
 }
 
@@ -76,12 +78,12 @@ impl EmbeddedRun<'_> {
         let options = ServeOptions {
             root: state.to_owned(),
             listen: self.listen,
-            dismiss_workers_when_idle: self.workers > 0,
+            dismiss_workers_when_idle: !self.workers.is_empty(),
             replaces_abandoned_jobs: true,
             stores: environment::stores(),
             ..ServeOptions::default()
         };
-        Ok(serve(options, Arc::new(self.engine.engine()?), shutdown.clone()).await?)
+        Ok(serve(options, self.engine.clone(), shutdown.clone()).await?)
     }
 
     async fn work(
@@ -97,15 +99,23 @@ impl EmbeddedRun<'_> {
             return Ok((None, None));
         };
         let submitted = submitted?.into_inner();
-        tracing::info!(address, job_id = submitted.job_id, resumed = submitted.resumed, "coordinator");
+        let device = self.engine.device_name().unwrap_or(self.engine.name());
+        tracing::info!(
+            address,
+            device,
+            job_id = submitted.job_id,
+            resumed = submitted.resumed,
+            "coordinator"
+        );
         eprintln!(
             "job {} {}; coordinator at {address}, output in {}",
             submitted.job_id,
             if submitted.resumed { "goes on" } else { "started" },
             self.output.display()
         );
-        let count = if is_done(&mut client, &submitted.job_id).await? { 0 } else { self.workers };
-        let mut workers = WorkerProcesses::start(count, address, state, self.engine)?;
+        let is_done = is_done(&mut client, &submitted.job_id).await?;
+        let needed: &[WorkerSetup] = if is_done { &[] } else { &self.workers };
+        let mut workers = WorkerProcesses::start(needed, address, state)?;
         let mut display = display::choose(self.logs, address);
         let (notes, mut noted) = mpsc::unbounded_channel();
         let following = follow(&mut client, &submitted.job_id, 0, display.as_mut(), &mut noted, stop);

@@ -4,6 +4,7 @@
 mod args;
 mod client;
 mod commands;
+mod device;
 mod display;
 mod embedded;
 mod environment;

@@ -10,7 +10,7 @@ use std::{
 use futures::future::select_all;
 use tokio::process::{Child, Command};
 
-use crate::{args::EngineArgs, error::CliError};
+use crate::{args::WorkerSetup, error::CliError};
 
 /// How long an embedded worker looks for its coordinator: it must not outlive a killed parent for long.
 const RECONNECT_SECONDS: u32 = 10;
@@ -36,17 +36,13 @@ pub(crate) struct EndedWorker {
 }
 
 impl WorkerProcesses {
-    /// Starts `count` workers of one thread each, numbered from 1, with logs in `folder`.
-    pub(crate) fn start(
-        count: usize,
-        coordinator: &str,
-        folder: &Path,
-        engine: EngineArgs,
-    ) -> Result<Self, CliError> {
+    /// Starts workers, numbered from 1, with logs in `folder`.
+    pub(crate) fn start(setups: &[WorkerSetup], coordinator: &str, folder: &Path) -> Result<Self, CliError> {
         let program = std::env::current_exe()
             .map_err(|error| CliError::failed("cannot find this program's file", error))?;
-        let running = (1..=count)
-            .map(|number| start_one(&program, number, coordinator, folder, engine))
+        let running = (1..)
+            .zip(setups)
+            .map(|(number, setup)| start_one(&program, number, setup, coordinator, folder))
             .collect::<Result<_, _>>()?;
         Ok(Self { running })
     }
@@ -82,17 +78,18 @@ impl WorkerProcesses {
 fn start_one(
     program: &Path,
     number: usize,
+    setup: &WorkerSetup,
     coordinator: &str,
     folder: &Path,
-    engine: EngineArgs,
 ) -> Result<Worker, CliError> {
     let log = folder.join(format!("worker-{number}.log"));
     let file = File::create(&log).map_err(|error| CliError::bad_input(log.display(), error))?;
     let child = Command::new(program)
-        .args(["worker", "--coordinator", coordinator, "--threads", "1", "--log-json"])
+        .args(["worker", "--coordinator", coordinator, "--log-json"])
+        .args(["--threads", &setup.threads.to_string()])
         .args(["--id", &format!("embedded-{number}")])
         .args(["--reconnect-for", &RECONNECT_SECONDS.to_string()])
-        .args(engine.to_arguments())
+        .args(&setup.arguments)
         .stdin(Stdio::null())
         .stdout(Stdio::null())
         .stderr(file)

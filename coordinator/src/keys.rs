@@ -2,7 +2,10 @@
 
 use prost::Message;
 use serde::Serialize;
-use splat::settings::{MotionSource, Settings};
+use splat::{
+    engine::Engine,
+    settings::{MotionSource, Settings},
+};
 use trackersplat_proto::v1::FrameJob;
 
 /// Part of every key: another version may compute other bytes.
@@ -46,8 +49,17 @@ pub(crate) struct TrackKey<'a> {
     pub(crate) view: &'a str,
 }
 
-/// Key of a frame's result: its inputs by digest, the settings that a frame job reads, engine and version.
-pub(crate) fn frame_key(job: &FrameJob, settings: &Settings, engine: &str) -> String {
+/// What a computation of the coordinator depends on besides its input: other devices round differently.
+pub(crate) fn engine_key(engine: &dyn Engine) -> String {
+    match engine.device_name() {
+        Some(device) => format!("{} {device}", engine.name()),
+        None => engine.name().to_owned(),
+    }
+}
+
+/// Key of a frame's result: its inputs by digest, the settings that a frame job reads, and the version. Not the device:
+/// any worker may compute it, and what one has computed no other computes again because it would round differently.
+pub(crate) fn frame_key(job: &FrameJob, settings: &Settings) -> String {
     let inputs = FrameJob { job_id: String::new(), settings_json: String::new(), ..job.clone() };
     #[derive(Serialize)]
     struct FrameSettings<'a> {
@@ -67,7 +79,7 @@ pub(crate) fn frame_key(job: &FrameJob, settings: &Settings, engine: &str) -> St
         refine: &settings.refine,
     };
     let inputs = blake3::hash(&inputs.encode_to_vec()).to_hex().to_string();
-    digest_of(&("frame", VERSION, engine, inputs, read))
+    digest_of(&("frame", VERSION, inputs, read))
 }
 
 #[cfg(test)]
@@ -81,20 +93,19 @@ mod tests {
         let settings = Settings::default();
         let job =
             FrameJob { job_id: "a".into(), frame: 2, settings_json: "{}".into(), ..FrameJob::default() };
-        let key = frame_key(&job, &settings, "cpu");
+        let key = frame_key(&job, &settings);
         let renamed = FrameJob { job_id: "b".into(), settings_json: "other text".into(), ..job.clone() };
-        assert_eq!(frame_key(&renamed, &settings, "cpu"), key);
+        assert_eq!(frame_key(&renamed, &settings), key);
 
         let image = Some(Blob { digest: "d".into(), size: 1 });
         let view = FrameView { image, ..FrameView::default() };
         let other_input = FrameJob { training_views: vec![view], ..job.clone() };
         let other_seed = Settings { seed: 1, ..settings.clone() };
         let others = [
-            frame_key(&other_input, &settings, "cpu"),
-            frame_key(&FrameJob { frame: 3, ..job.clone() }, &settings, "cpu"),
-            frame_key(&FrameJob { key_frame: true, ..job.clone() }, &settings, "cpu"),
-            frame_key(&job, &other_seed, "cpu"),
-            frame_key(&job, &settings, "wgpu"),
+            frame_key(&other_input, &settings),
+            frame_key(&FrameJob { frame: 3, ..job.clone() }, &settings),
+            frame_key(&FrameJob { key_frame: true, ..job.clone() }, &settings),
+            frame_key(&job, &other_seed),
         ];
         assert!(others.iter().all(|other| *other != key));
     }

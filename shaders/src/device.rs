@@ -1,9 +1,8 @@
 //! Which devices there are, and one of them opened.
 
-use std::{
-    fmt,
-    sync::{Arc, Mutex, PoisonError},
-};
+mod choice;
+
+use std::sync::{Arc, Mutex, PoisonError};
 
 use splat::engine::EngineError;
 use thiserror::Error;
@@ -11,6 +10,8 @@ use wgpu::{
     Adapter, Backends, Device, DeviceDescriptor, DeviceType, Features, Instance, InstanceDescriptor,
     InstanceFlags, Limits, Queue,
 };
+
+pub use self::choice::{DeviceChoice, choose, real_gpus};
 
 /// What sort of device it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,21 +41,12 @@ pub struct DeviceDescription {
     pub backend: String,
     /// Driver and its version.
     pub driver: String,
+    /// Memory that jobs can have, bytes, where the driver says: a card's own, else the largest it sees. Unknown for software.
+    pub memory: Option<u64>,
     /// Largest buffer that a kernel can see, bytes.
     pub max_binding: u64,
     /// Optional capabilities that faster kernels could use: `subgroup`, `f16`, `int64`, `timestamps`.
     pub features: Vec<&'static str>,
-}
-
-/// Which device to open.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum DeviceChoice {
-    /// The best that is no software: discrete before integrated before the others.
-    Auto,
-    /// By its number in [`devices`].
-    Index(usize),
-    /// The first whose name contains this, upper and lower case alike.
-    Name(String),
 }
 
 /// Why no device was opened.
@@ -68,6 +60,14 @@ pub enum DeviceError {
         /// What there is.
         found: String,
     },
+    /// Several fit.
+    #[error("several GPUs fit `{name}`: {found}; give the number of one")]
+    Ambiguous {
+        /// What was asked for.
+        name: String,
+        /// Those that fit.
+        found: String,
+    },
     /// The driver refused.
     #[error("cannot open {name}: {reason}; see whether its driver works")]
     Refused {
@@ -78,24 +78,32 @@ pub enum DeviceError {
     },
 }
 
-impl fmt::Display for DeviceChoice {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Auto => write!(f, "auto"),
-            Self::Index(index) => write!(f, "gpu:{index}"),
-            Self::Name(name) => write!(f, "{name}"),
-        }
-    }
-}
+/// Parts of the names of software adapters, lower case, for drivers that do not say what they are.
+const SOFTWARE: [&str; 4] = ["llvmpipe", "lavapipe", "swiftshader", "microsoft basic render"];
 
 impl DeviceKind {
-    fn of(kind: DeviceType) -> Self {
+    fn of(kind: DeviceType, name: &str) -> Self {
+        let name = name.to_lowercase();
+        if SOFTWARE.iter().any(|software| name.contains(software)) {
+            return Self::Software;
+        }
         match kind {
             DeviceType::DiscreteGpu => Self::Discrete,
             DeviceType::IntegratedGpu => Self::Integrated,
             DeviceType::VirtualGpu => Self::Virtual,
             DeviceType::Cpu => Self::Software,
             DeviceType::Other => Self::Unknown,
+        }
+    }
+
+    /// The kind as people and scripts read it.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Discrete => "discrete",
+            Self::Integrated => "integrated",
+            Self::Virtual => "virtual",
+            Self::Software => "software",
+            Self::Unknown => "unknown",
         }
     }
 
@@ -114,6 +122,7 @@ impl DeviceKind {
 impl DeviceDescription {
     fn new(index: usize, adapter: &Adapter) -> Self {
         let info = adapter.get_info();
+        let kind = DeviceKind::of(info.device_type, &info.name);
         let has = adapter.features();
         let optional = [
             (Features::SUBGROUP, "subgroup"),
@@ -123,8 +132,9 @@ impl DeviceDescription {
         ];
         Self {
             index,
+            kind,
+            memory: memory(adapter, kind),
             name: info.name,
-            kind: DeviceKind::of(info.device_type),
             backend: info.backend.to_string(),
             driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
             max_binding: adapter.limits().max_storage_buffer_binding_size,
@@ -135,6 +145,38 @@ impl DeviceDescription {
                 .collect(),
         }
     }
+
+    /// Name, backend and driver: what decides how results are rounded.
+    pub fn label(&self) -> String {
+        let driver = if self.driver.is_empty() { String::new() } else { format!(", {}", self.driver) };
+        format!("{} ({}{driver})", self.name, self.backend)
+    }
+}
+
+/// Memory of a device, where its driver says.
+#[cfg(not(target_vendor = "apple"))]
+fn memory(adapter: &Adapter, kind: DeviceKind) -> Option<u64> {
+    const DEVICE_LOCAL: u32 = 1;
+    if kind == DeviceKind::Software {
+        // What such drivers say is a constant of theirs; they use the memory of the host.
+        return None;
+    }
+    // SAFETY: the handles are only asked for properties, and nothing of them outlives the adapter.
+    let memory = unsafe {
+        let adapter = adapter.as_hal::<wgpu::hal::api::Vulkan>()?;
+        let instance = adapter.shared_instance().raw_instance();
+        instance.get_physical_device_memory_properties(adapter.raw_physical_device())
+    };
+    let heaps = &memory.memory_heaps[..memory.memory_heap_count as usize];
+    let has_its_own = matches!(kind, DeviceKind::Discrete | DeviceKind::Virtual);
+    let counts = |flags: u32| !has_its_own || flags & DEVICE_LOCAL != 0;
+    heaps.iter().filter(|heap| counts(heap.flags.as_raw())).map(|heap| heap.size).max()
+}
+
+/// Memory of a device: no driver here says.
+#[cfg(target_vendor = "apple")]
+fn memory(_adapter: &Adapter, _kind: DeviceKind) -> Option<u64> {
+    None
 }
 
 /// The devices of this machine, software ones included, in the order in which [`DeviceChoice::Index`] counts.
@@ -163,6 +205,7 @@ pub struct GpuDevice {
     pub(crate) device: Device,
     pub(crate) queue: Queue,
     description: DeviceDescription,
+    label: String,
     limits: Limits,
     memory_limit: Option<u64>,
     fault: Arc<Mutex<Fault>>,
@@ -177,10 +220,8 @@ impl GpuDevice {
             .enumerate()
             .map(|(index, adapter)| DeviceDescription::new(index, adapter))
             .collect();
-        let chosen = choose(choice, &descriptions)
-            .ok_or_else(|| DeviceError::NotFound { choice: choice.clone(), found: listed(&descriptions) })?;
-        let description = descriptions[chosen].clone();
-        Self::request(&adapters[chosen], description)
+        let description = choose(choice, &descriptions)?.clone();
+        Self::request(&adapters[description.index], description)
     }
 
     fn request(adapter: &Adapter, description: DeviceDescription) -> Result<Self, DeviceError> {
@@ -212,10 +253,12 @@ impl GpuDevice {
             let mut fault = failed.lock().unwrap_or_else(PoisonError::into_inner);
             fault.error.get_or_insert(error.to_string());
         }));
-        Ok(Self { device, queue, description, limits, memory_limit: None, fault })
+        let (label, memory_limit) = (description.label(), description.memory);
+        Ok(Self { device, queue, description, label, limits, memory_limit, fault })
     }
 
-    /// Lets jobs take so many bytes at most; without it, jobs take what the driver grants, which it does not tell before.
+    /// Lets jobs take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where that is not
+    /// known, for what the driver grants, which it does not tell before.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
         Self { memory_limit: Some(bytes), ..self }
     }
@@ -230,6 +273,11 @@ impl GpuDevice {
         &self.description
     }
 
+    /// [`DeviceDescription::label`].
+    pub(crate) fn label(&self) -> &str {
+        &self.label
+    }
+
     /// Largest buffer that a kernel can see, bytes.
     pub(crate) fn max_buffer(&self) -> u64 {
         // Kernels count words in 32 bits.
@@ -238,7 +286,7 @@ impl GpuDevice {
     }
 
     /// Whether the device still does what it is told.
-    pub(crate) fn check(&self) -> Result<(), EngineError> {
+    pub fn check(&self) -> Result<(), EngineError> {
         let fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner);
         match (&fault.lost, &fault.error) {
             (Some(lost), _) => Err(EngineError::DeviceLost(format!("{}: {lost}", self.description.name))),
@@ -250,71 +298,16 @@ impl GpuDevice {
     }
 }
 
-fn choose(choice: &DeviceChoice, devices: &[DeviceDescription]) -> Option<usize> {
-    match choice {
-        DeviceChoice::Auto => {
-            let ranked = devices.iter().filter_map(|device| Some((device.kind.preference()?, device.index)));
-            ranked.min().map(|(_, index)| index)
-        }
-        DeviceChoice::Index(index) => (*index < devices.len()).then_some(*index),
-        DeviceChoice::Name(name) => {
-            let name = name.to_lowercase();
-            devices.iter().position(|device| device.name.to_lowercase().contains(&name))
-        }
-    }
-}
-
-fn listed(devices: &[DeviceDescription]) -> String {
-    if devices.is_empty() {
-        return "none (is a Vulkan, Metal or DirectX 12 driver installed?)".to_owned();
-    }
-    let one = |device: &DeviceDescription| {
-        let software =
-            if device.kind == DeviceKind::Software { ", software: only by its name or number" } else { "" };
-        format!("gpu:{} {} ({}{software})", device.index, device.name, device.backend)
-    };
-    devices.iter().map(one).collect::<Vec<_>>().join("; ")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn device(index: usize, name: &str, kind: DeviceKind) -> DeviceDescription {
-        DeviceDescription {
-            index,
-            name: name.to_owned(),
-            kind,
-            backend: "vulkan".to_owned(),
-            driver: String::new(),
-            max_binding: 0,
-            features: Vec::new(),
-        }
-    }
-
     #[test]
-    fn auto_takes_the_best_card_and_never_software() {
-        let software = device(0, "llvmpipe", DeviceKind::Software);
-        assert_eq!(choose(&DeviceChoice::Auto, &[]), None);
-        assert_eq!(choose(&DeviceChoice::Auto, std::slice::from_ref(&software)), None);
-        let all = [
-            software,
-            device(1, "built in", DeviceKind::Integrated),
-            device(2, "Card A", DeviceKind::Discrete),
-            device(3, "Card B", DeviceKind::Discrete),
-        ];
-        assert_eq!(choose(&DeviceChoice::Auto, &all), Some(2));
-        assert_eq!(choose(&DeviceChoice::Name("card b".to_owned()), &all), Some(3));
-        assert_eq!(choose(&DeviceChoice::Name("llvm".to_owned()), &all), Some(0));
-        assert_eq!(choose(&DeviceChoice::Name("card c".to_owned()), &all), None);
-        assert_eq!(choose(&DeviceChoice::Index(1), &all), Some(1));
-        assert_eq!(choose(&DeviceChoice::Index(4), &all), None);
-    }
-
-    #[test]
-    fn what_there_is_is_told() {
-        let text = listed(&[device(0, "llvmpipe", DeviceKind::Software)]);
-        assert!(text.contains("gpu:0 llvmpipe") && text.contains("software"), "{text}");
-        assert!(listed(&[]).contains("driver"));
+    fn software_is_known_by_its_name_where_the_driver_is_silent() {
+        let kind = |name| DeviceKind::of(DeviceType::Other, name);
+        assert_eq!(kind("SwiftShader Device (LLVM 10.0.0)"), DeviceKind::Software);
+        assert_eq!(kind("Some Card"), DeviceKind::Unknown);
+        assert_eq!(DeviceKind::of(DeviceType::VirtualGpu, "Venus (llvmpipe)"), DeviceKind::Software);
+        assert_eq!(DeviceKind::of(DeviceType::Cpu, "x"), DeviceKind::Software);
     }
 }

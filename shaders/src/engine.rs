@@ -176,6 +176,14 @@ impl Engine for GpuEngine {
         "gpu"
     }
 
+    fn device_name(&self) -> Option<&str> {
+        Some(self.context.device.label())
+    }
+
+    fn check(&self) -> Result<(), EngineError> {
+        self.context.device.check()
+    }
+
     fn render(
         &self,
         gaussians: &Gaussians,

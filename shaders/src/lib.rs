@@ -28,6 +28,8 @@ mod stages;
 mod tests;
 mod wanted;
 
-pub use device::{DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, devices};
+pub use device::{
+    DeviceChoice, DeviceDescription, DeviceError, DeviceKind, GpuDevice, choose, devices, real_gpus,
+};
 pub use engine::GpuEngine;
 pub use probe::{Probe, Stage};

@@ -174,6 +174,16 @@ pub trait Engine: Send + Sync {
     /// Short name for reports, such as `cpu`.
     fn name(&self) -> &str;
 
+    /// The device and its driver, for people; `None` for the processor that runs this program.
+    fn device_name(&self) -> Option<&str> {
+        None
+    }
+
+    /// Whether the device is there to work. An engine that can come back to a lost device does so here.
+    fn check(&self) -> Result<(), EngineError> {
+        Ok(())
+    }
+
     /// Renders one view.
     fn render(
         &self,

@@ -48,8 +48,16 @@ impl Service {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join("root");
         let root = root.to_str().unwrap();
-        let mut coordinator =
-            program::start(["coordinator", "--root", root, "--listen", "127.0.0.1:0", "--quiet"]);
+        let mut coordinator = program::start([
+            "coordinator",
+            "--root",
+            root,
+            "--listen",
+            "127.0.0.1:0",
+            "--device",
+            "cpu",
+            "--quiet",
+        ]);
         let address = coordinator.wait_for(&["http://127.0.0.1:"]).trim().to_owned();
         Self { _coordinator: coordinator, address, folder }
     }
@@ -64,7 +72,7 @@ impl Service {
     }
 
     fn worker(&self, more: &[&str]) -> Running {
-        program::start(self.arguments(&[&["worker", "--threads", "1"], more].concat()))
+        program::start(self.arguments(&[&["worker", "--threads", "1", "--device", "cpu"], more].concat()))
     }
 
     fn run(&self, arguments: &[&str]) -> (i32, String) {
@@ -195,7 +203,8 @@ fn a_fetched_folder_can_be_inspected_rendered_and_measured() {
     let (width, height) = image::image_dimensions(&png).unwrap();
     assert_eq!((&view["camera"]["width"], &view["camera"]["height"]), (&width.into(), &height.into()));
 
-    let measured: Vec<Value> = serde_json::from_str(&plain(&["eval", folder, "--json"])).unwrap();
+    let measured: Vec<Value> =
+        serde_json::from_str(&plain(&["eval", folder, "--json", "--device", "cpu"])).unwrap();
     assert_eq!(measured.len(), 2);
     for (now, then) in measured.iter().zip(sequence["frames"].as_array().unwrap()) {
         let psnr = |views: &Value| {

@@ -20,8 +20,10 @@ use trackersplat_tests::{
 };
 
 /// Short enough for a gate, long enough to be killed in the middle of a frame.
-const SETTINGS: [&str; 13] = [
+const SETTINGS: [&str; 15] = [
     "-v",
+    "--device",
+    "cpu",
     "--tracks",
     "exact",
     "--set",
@@ -151,6 +153,8 @@ fn without_workers_the_run_waits_says_so_and_goes_on_when_one_joins() {
         "worker",
         "--coordinator",
         &address,
+        "--device",
+        "cpu",
         "--threads",
         "1",
         "--state-dir",

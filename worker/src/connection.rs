@@ -14,7 +14,7 @@ use trackersplat_proto::v1::{
     workers_client::WorkersClient,
 };
 
-use crate::run::WorkerError;
+use crate::setup::WorkerError;
 
 /// Longest wait for the connection and for the answer to `Register`.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);

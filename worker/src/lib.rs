@@ -3,6 +3,7 @@
 //! | file | idea |
 //! |---|---|
 //! | `run.rs` | what a worker does with each message, from registration to dismissal |
+//! | `setup.rs` | how a worker is set up, and why it ends |
 //! | `connection.rs` | one bidirectional stream to the coordinator, and getting it back |
 //! | `job.rs` | a frame job from the wire to a report |
 //! | `ahead.rs` | the next frame's inputs, loaded while the present one is computed |
@@ -15,7 +16,9 @@ mod connection;
 mod inputs;
 mod job;
 mod run;
+mod setup;
 #[cfg(test)]
 mod test_coordinator;
 
-pub use run::{Exit, WorkerError, WorkerOptions, run};
+pub use run::run;
+pub use setup::{Exit, WorkerError, WorkerOptions};

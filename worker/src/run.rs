@@ -3,13 +3,11 @@
 use std::{
     future::pending,
     hash::{Hash, Hasher},
-    path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
 };
 
 use splat::{engine::Engine, frame::FrameProgress};
-use thiserror::Error;
 use tokio::{
     sync::watch,
     task::JoinHandle,
@@ -18,7 +16,7 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 use trackersplat_proto::{
-    ids::{InvalidId, check_worker_id},
+    ids::check_worker_id,
     v1::{
         Failure, FailureKind, GoingAway, Heartbeat, Lease, LeaseRequest, Register, Report,
         coordinator_message, worker_message,
@@ -30,6 +28,7 @@ use crate::{
     blobs::Blobs,
     connection::{self, Connection, ConnectionError},
     job::{JobRunner, Outcome, Reconstruct},
+    setup::{Exit, WorkerError, WorkerOptions, thread_pool, worker_id},
 };
 
 /// Longest wait for the last words to reach the coordinator, and for the running step to end, at shutdown.
@@ -41,77 +40,17 @@ const DEFAULT_HEARTBEAT: Duration = Duration::from_secs(1);
 /// Pause before a stream that broke is opened again, so that a coordinator that drops everybody is not flooded.
 const RECONNECT_PAUSE: Duration = Duration::from_millis(100);
 
-/// How a worker is set up.
-#[derive(Clone, Debug)]
-pub struct WorkerOptions {
-    /// The coordinator's address, `http://host:port`.
-    pub coordinator: String,
-    /// Threads of the worker's pool, at least 1.
-    pub threads: usize,
-    /// Name of the worker, stable across restarts; `None`: the one in `state_dir`, else a new one.
-    pub worker_id: Option<String>,
-    /// Folder that remembers the worker's name.
-    pub state_dir: Option<PathBuf>,
-    /// How long the coordinator may be away before the worker gives up.
-    pub reconnect_for: Duration,
-    /// Whether bulk always goes through the coordinator, even where its store's directory is visible.
-    pub remote_blobs: bool,
+/// Why a stream is not served any longer, if the worker's work is not over.
+enum StreamEnd {
+    Connection(ConnectionError),
+    /// The device is lost for good; the coordinator has the frame back.
+    Device(String),
 }
 
-/// Why a worker ended well.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Exit {
-    /// The coordinator needs no more workers.
-    Dismissed,
-    /// The caller asked for it.
-    ShutDown,
-}
-
-/// Why a worker ended badly.
-#[derive(Debug, Error)]
-pub enum WorkerError {
-    /// The address is no `http://host:port`.
-    #[error("coordinator address '{0}' is not of the form http://host:port")]
-    BadAddress(String),
-    /// The name cannot be sent.
-    #[error(transparent)]
-    BadName(#[from] InvalidId),
-    /// No thread pool of that size.
-    #[error("cannot start {threads} worker threads: {reason}; give a smaller number, at least 1")]
-    Threads {
-        /// Threads that were asked for.
-        threads: usize,
-        /// What the system says.
-        reason: String,
-    },
-    /// The worker's name cannot be read or remembered.
-    #[error("worker state in {path}: {reason}; give a folder that can be written")]
-    State {
-        /// The file.
-        path: PathBuf,
-        /// What the system says.
-        reason: String,
-    },
-    /// The coordinator does not want this worker.
-    #[error("the coordinator at {coordinator} refuses this worker: {reason}")]
-    Refused {
-        /// Its address.
-        coordinator: String,
-        /// What it says.
-        reason: String,
-    },
-    /// The coordinator stayed away for longer than `reconnect_for`.
-    #[error(
-        "no coordinator at {coordinator} for {seconds} s: {reason}; check the address and that it runs, then start the worker again"
-    )]
-    Unreachable {
-        /// Its address.
-        coordinator: String,
-        /// How long it was tried.
-        seconds: u64,
-        /// The last failure.
-        reason: String,
-    },
+impl From<ConnectionError> for StreamEnd {
+    fn from(error: ConnectionError) -> Self {
+        Self::Connection(error)
+    }
 }
 
 /// Works for a coordinator until it is dismissed, shut down, or given up on.
@@ -123,21 +62,24 @@ pub enum WorkerError {
 /// with a receipt that is not accepted. A report that was accepted before, and comes again because its receipt was lost,
 /// is accepted again; one that is being verified gets no receipt yet, so it is sent until it gets one. Then the worker
 /// asks for the next frame. Needs a tokio runtime with timers and I/O.
+///
+/// After a failed frame the worker asks for the next one only if the engine's device is there, or came back
+/// ([`Engine::check`]); else it ends with [`WorkerError::Device`], so that it does not fail one frame after the other.
 pub async fn run(
     options: WorkerOptions,
     engine: Arc<dyn Engine>,
     shutdown: CancellationToken,
 ) -> Result<Exit, WorkerError> {
-    let engine_name = engine.name().to_owned();
+    let computing = engine.clone();
     let reconstruct: Reconstruct =
-        Arc::new(move |input, progress| splat::frame::reconstruct_frame(engine.as_ref(), input, progress));
-    run_with(options, &engine_name, reconstruct, shutdown).await
+        Arc::new(move |input, progress| splat::frame::reconstruct_frame(computing.as_ref(), input, progress));
+    run_with(options, engine, reconstruct, shutdown).await
 }
 
 /// [`run`] with any way to reconstruct a frame.
 pub(crate) async fn run_with(
     options: WorkerOptions,
-    engine: &str,
+    engine: Arc<dyn Engine>,
     reconstruct: Reconstruct,
     shutdown: CancellationToken,
 ) -> Result<Exit, WorkerError> {
@@ -150,13 +92,17 @@ pub(crate) async fn run_with(
         };
         tracing::info!(
             worker_id = worker.register.worker_id,
+            device = worker.register.device,
             coordinator = worker.options.coordinator,
             "registered"
         );
         match worker.serve(connected).await {
             Ok(exit) => return Ok(exit),
-            Err(ConnectionError::Refused(reason)) => return Err(worker.refused(reason)),
-            Err(ConnectionError::Lost(reason)) => {
+            Err(StreamEnd::Device(reason)) => return Err(WorkerError::Device { reason }),
+            Err(StreamEnd::Connection(ConnectionError::Refused(reason))) => {
+                return Err(worker.refused(reason));
+            }
+            Err(StreamEnd::Connection(ConnectionError::Lost(reason))) => {
                 tracing::warn!(reason, "lost the coordinator, connecting again")
             }
         }
@@ -178,8 +124,11 @@ struct Worker {
     register: Register,
     jitter_seed: u64,
     channel: Channel,
+    engine: Arc<dyn Engine>,
     runner: Arc<JobRunner>,
     shutdown: CancellationToken,
+    /// Whether a frame failed since the device was last looked at.
+    is_device_in_doubt: bool,
     running: Option<RunningLease>,
     /// The last result, until the coordinator says it has it.
     unacknowledged: Option<Report>,
@@ -188,7 +137,7 @@ struct Worker {
 impl Worker {
     fn new(
         options: WorkerOptions,
-        engine: &str,
+        engine: Arc<dyn Engine>,
         reconstruct: Reconstruct,
         shutdown: CancellationToken,
     ) -> Result<Self, WorkerError> {
@@ -203,8 +152,11 @@ impl Worker {
         let register = Register {
             worker_id,
             incarnation: incarnation.to_string(),
-            engine: engine.to_owned(),
-            device: format!("{} threads, {}", options.threads, std::env::consts::ARCH),
+            engine: engine.name().to_owned(),
+            device: engine.device_name().map_or_else(
+                || format!("{} threads, {}", options.threads, std::env::consts::ARCH),
+                str::to_owned,
+            ),
             threads: u32::try_from(options.threads).unwrap_or(u32::MAX),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             held_lease_id: String::new(),
@@ -222,8 +174,10 @@ impl Worker {
             register,
             jitter_seed,
             channel,
+            engine,
             runner,
             shutdown,
+            is_device_in_doubt: false,
             running: None,
             unacknowledged: None,
         })
@@ -255,7 +209,7 @@ impl Worker {
     }
 
     /// Works over one stream until it breaks or the worker's work is over.
-    async fn serve(&mut self, mut connection: Connection) -> Result<Exit, ConnectionError> {
+    async fn serve(&mut self, mut connection: Connection) -> Result<Exit, StreamEnd> {
         let blobs = if self.options.remote_blobs {
             Blobs::through_coordinator(self.channel.clone())
         } else {
@@ -281,6 +235,12 @@ impl Worker {
                     coordinator_message::Message::CancelLease(cancel) => self.cancel(&cancel.lease_id, &cancel.reason),
                     coordinator_message::Message::Receipt(receipt) => {
                         if self.acknowledge(&receipt.lease_id, receipt.accepted, &receipt.reason) {
+                            if let Err(reason) = self.look_at_device().await {
+                                let goodbye = GoingAway { reason: reason.clone() };
+                                connection.send(worker_message::Message::GoingAway(goodbye))?;
+                                connection.close(FAREWELL).await;
+                                return Err(StreamEnd::Device(reason));
+                            }
                             connection.send(worker_message::Message::LeaseRequest(LeaseRequest {}))?;
                         }
                     }
@@ -339,6 +299,20 @@ impl Worker {
         running.cancel.cancel();
     }
 
+    /// Whether the device is there for another frame; it may be opened again for that, which takes a while.
+    async fn look_at_device(&mut self) -> Result<(), String> {
+        if !std::mem::take(&mut self.is_device_in_doubt) {
+            return Ok(());
+        }
+        let engine = self.engine.clone();
+        let looked = tokio::task::spawn_blocking(move || engine.check()).await;
+        match looked {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(error)) => Err(error.to_string()),
+            Err(error) => Err(format!("looking at it: {error}")),
+        }
+    }
+
     /// Takes the finished lease out and makes its report; `None` if it was cancelled.
     fn report_of(&mut self, outcome: Option<Outcome>) -> Option<Report> {
         let running = self.running.take()?;
@@ -346,6 +320,7 @@ impl Worker {
         match &outcome {
             Outcome::Success(_) => tracing::info!(lease_id = running.lease_id, "frame done"),
             Outcome::Failure(failure) => {
+                self.is_device_in_doubt = true;
                 tracing::warn!(
                     lease_id = running.lease_id,
                     kind = failure.kind().as_str_name(),
@@ -429,44 +404,6 @@ fn heartbeat_period(milliseconds: u32) -> Duration {
         0 => DEFAULT_HEARTBEAT,
         milliseconds => Duration::from_millis(milliseconds.into()),
     }
-}
-
-fn thread_pool(threads: usize) -> Result<rayon::ThreadPool, WorkerError> {
-    let failed = |reason: String| WorkerError::Threads { threads, reason };
-    if threads == 0 {
-        return Err(failed("a worker needs a thread".into()));
-    }
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .thread_name(|index| format!("frame-{index}"))
-        .build()
-        .map_err(|error| failed(error.to_string()))
-}
-
-/// The given name, else the remembered one, else a new one that is remembered if there is a folder for it.
-fn worker_id(options: &WorkerOptions, incarnation: uuid::Uuid) -> Result<String, WorkerError> {
-    if let Some(id) = &options.worker_id {
-        return Ok(id.clone());
-    }
-    let fresh = format!("worker-{}", incarnation.simple());
-    let Some(directory) = &options.state_dir else { return Ok(fresh) };
-    let path = directory.join("worker-id");
-    let failed = |error: std::io::Error| WorkerError::State { path: path.clone(), reason: error.to_string() };
-    match std::fs::read_to_string(&path) {
-        Ok(known) if !known.trim().is_empty() => return Ok(known.trim().to_owned()),
-        Ok(_) => {}
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
-        Err(error) => return Err(failed(error)),
-    }
-    remember(directory, &path, &fresh).map_err(failed)?;
-    Ok(fresh)
-}
-
-fn remember(directory: &Path, path: &Path, id: &str) -> std::io::Result<()> {
-    std::fs::create_dir_all(directory)?;
-    let temporary = path.with_extension("partial");
-    std::fs::write(&temporary, id)?;
-    std::fs::rename(temporary, path)
 }
 
 #[cfg(test)]

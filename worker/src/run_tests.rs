@@ -7,9 +7,13 @@ use std::{
 };
 
 use splat::{
-    engine::EngineError,
+    cameras::Camera,
+    engine::{EngineError, Rendering, SessionInput},
     frame::{FrameError, FrameReport, FrameResult},
-    gaussians::delta,
+    gaussians::{Gaussians, delta},
+    motion::{moments::FootprintMoments, reweighting::Reweighting},
+    raster::CpuEngine,
+    tracking::TrackField,
 };
 use tonic::Status;
 use trackersplat_proto::v1::{CancelLease, Dismiss, report};
@@ -36,7 +40,8 @@ fn options(coordinator: &TestCoordinator) -> WorkerOptions {
 
 fn start_with(options: WorkerOptions, reconstruct: Reconstruct) -> (Running, CancellationToken) {
     let shutdown = CancellationToken::new();
-    let task = tokio::spawn(run_with(options, "cpu", reconstruct, shutdown.clone()));
+    let engine = Arc::new(CpuEngine::default());
+    let task = tokio::spawn(run_with(options, engine, reconstruct, shutdown.clone()));
     (task, shutdown)
 }
 
@@ -255,13 +260,16 @@ async fn a_panic_is_a_bug_report_and_the_worker_lives_on() {
 }
 
 #[tokio::test]
-async fn failures_carry_their_kind() {
+async fn failures_carry_their_kind_and_figures() {
     let coordinator = TestCoordinator::start().await;
-    let memory = fails(|| EngineError::OutOfResources { needed: 2, available: 1 }.into());
+    let memory =
+        fails(|| EngineError::OutOfResources { needed: 5_000_000_000, available: 4_000_000_000 }.into());
     let (worker, shutdown) = start(&coordinator, memory);
     let mut session = coordinator.welcome().await;
     session.lease("lease-1", coordinator.frame_job(2)).await;
-    assert_eq!(failure(session.wait_for_report().await).0, FailureKind::OutOfResources);
+    let (kind, message) = failure(session.wait_for_report().await);
+    assert_eq!(kind, FailureKind::OutOfResources);
+    assert!(message.contains("5000000000") && message.contains("4000000000"), "{message}");
     shutdown.cancel();
     drop(session);
     worker.await.unwrap().unwrap();
@@ -360,4 +368,77 @@ async fn a_name_that_cannot_be_sent_is_refused_before_anything_starts() {
     let options = WorkerOptions { worker_id: Some("a name/with a path".into()), ..options(&coordinator) };
     let (worker, _shutdown) = start_with(options, shift());
     assert!(matches!(worker.await.unwrap(), Err(WorkerError::BadName(_))));
+}
+
+/// A device that is lost in every frame, and that comes back so many times.
+struct FailingEngine {
+    returns: std::sync::Mutex<u32>,
+}
+
+const GONE: &str = "it fell off the bus";
+
+impl Engine for FailingEngine {
+    fn name(&self) -> &str {
+        "gpu"
+    }
+
+    fn device_name(&self) -> Option<&str> {
+        Some("Card A (vulkan)")
+    }
+
+    fn check(&self) -> Result<(), EngineError> {
+        let mut returns = self.returns.lock().unwrap();
+        *returns = returns.checked_sub(1).ok_or_else(|| EngineError::DeviceLost(GONE.into()))?;
+        Ok(())
+    }
+
+    fn render(&self, _: &Gaussians, _: &Camera, _: [f32; 3]) -> Result<Rendering, EngineError> {
+        Err(EngineError::DeviceLost(GONE.into()))
+    }
+
+    fn footprint_moments(
+        &self,
+        _: &Gaussians,
+        _: &Camera,
+        _: &TrackField,
+        _: Option<&Reweighting>,
+    ) -> Result<Vec<FootprintMoments>, EngineError> {
+        Err(EngineError::DeviceLost(GONE.into()))
+    }
+
+    fn session(&self, _: SessionInput) -> Result<Box<dyn splat::engine::Session>, EngineError> {
+        Err(EngineError::DeviceLost(GONE.into()))
+    }
+}
+
+#[tokio::test]
+async fn a_lost_device_fails_its_frame_as_transient_and_the_worker_goes_on_only_if_it_comes_back() {
+    let coordinator = TestCoordinator::start().await;
+    let engine = Arc::new(FailingEngine { returns: 1.into() });
+    let worker = tokio::spawn(run(options(&coordinator), engine, CancellationToken::new()));
+    let mut session = coordinator.welcome().await;
+    assert_eq!((&*session.register.engine, &*session.register.device), ("gpu", "Card A (vulkan)"));
+    session.wait_for_lease_request().await;
+    for (lease, comes_back) in [("lease-1", true), ("lease-2", false)] {
+        // The key frame is only rendered.
+        session.lease(lease, coordinator.frame_job(1)).await;
+        let report = session.wait_for_report().await;
+        assert_eq!(report.lease_id, lease);
+        session.acknowledge(&report).await;
+        let (kind, message) = failure(report);
+        assert_eq!(kind, FailureKind::Transient);
+        assert!(message.contains(GONE), "{message}");
+        let next = session.wait_for(|message| match message {
+            worker_message::Message::LeaseRequest(_) => Some(None),
+            worker_message::Message::GoingAway(goodbye) => Some(Some(goodbye.reason)),
+            _ => None,
+        });
+        match next.await {
+            None => assert!(comes_back, "a worker without a device asks for no frame"),
+            Some(reason) => assert!(!comes_back && reason.contains(GONE), "{reason}"),
+        }
+    }
+    drop(session);
+    let error = worker.await.unwrap().unwrap_err();
+    assert!(matches!(&error, WorkerError::Device { reason } if reason.contains(GONE)), "{error}");
 }

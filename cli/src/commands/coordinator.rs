@@ -1,6 +1,6 @@
 //! `coordinator`: serves jobs to workers and clients.
 
-use std::{net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
+use std::{net::SocketAddr, path::PathBuf, time::Duration};
 
 use clap::Args;
 use trackersplat_coordinator::{ServeOptions, serve};
@@ -62,7 +62,7 @@ pub(super) async fn run(args: CoordinatorArgs) -> Result<(), CliError> {
         stores: environment::stores(),
         ..defaults
     };
-    let running = serve(options, Arc::new(args.engine.engine()?), interrupted).await?;
+    let running = serve(options, args.engine.engine()?, interrupted).await?;
     // For scripts that let the system choose the port.
     stdout::line(format_args!("http://{}", running.address));
     Ok(running.finished().await?)

@@ -13,7 +13,7 @@ use crate::{
 
 /// The clip's place in the repository.
 const DEMO_CLIP: &str = "assets/demo-clip";
-/// Workers unless stated otherwise.
+/// Workers on a machine without a GPU unless stated otherwise.
 const WORKERS: usize = 2;
 
 /// Arguments of `demo`.
@@ -41,7 +41,7 @@ pub(super) async fn run(args: DemoArgs, logs: &LogArgs) -> Result<(), CliError> 
         settings: args.settings,
     };
     let request = job.request(Some(&args.out))?;
-    reconstruct(request, &args.out, args.run.workers.unwrap_or(WORKERS), &args.run, logs).await
+    reconstruct(request, &args.out, WORKERS, &args.run, logs).await
 }
 
 /// The current folder, the folders above the program, the repository that it was built from.

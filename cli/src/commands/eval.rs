@@ -9,12 +9,12 @@ use splat::{
     engine::Engine,
     formats::ply,
     frame::{self, ViewMetrics},
-    raster::CpuEngine,
 };
 use trackersplat_coordinator::assembly::sequence::{Sequence, SequenceFrame};
 
 use super::print_json;
 use crate::{
+    args::EngineArgs,
     embedded::STATE_FOLDER,
     error::CliError,
     scratch::{self, OpenedClip},
@@ -34,6 +34,9 @@ pub(crate) struct EvalArgs {
     /// Print JSON.
     #[arg(long)]
     json: bool,
+
+    #[command(flatten)]
+    engine: EngineArgs,
 }
 
 /// Metrics of one frame: as recorded when it was made, and as measured now.
@@ -45,11 +48,12 @@ struct Measured {
 }
 
 pub(super) fn run(args: EvalArgs) -> Result<(), CliError> {
+    let engine = args.engine.engine()?;
     let sequence = read_sequence(&args.dir)?;
     let clip = open_clip(&args.dir, &sequence, args.clip.as_deref())?;
     let mut measured = Vec::new();
     for frame in sequence.frames.iter().filter(|frame| frame.is_done()) {
-        measured.push(measure(&args.dir, &sequence, frame, &clip.clip)?);
+        measured.push(measure(engine.as_ref(), &args.dir, &sequence, frame, &clip.clip)?);
     }
     if args.json {
         return print_json(&measured);
@@ -105,6 +109,7 @@ fn open_clip(folder: &Path, sequence: &Sequence, elsewhere: Option<&Path>) -> Re
 }
 
 fn measure(
+    engine: &dyn Engine,
     folder: &Path,
     sequence: &Sequence,
     frame: &SequenceFrame,
@@ -118,7 +123,7 @@ fn measure(
     for (position, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Test) {
         let truth = clip.image(position, index).map_err(bad_clip)?;
         let mask = clip.mask(position, index).map_err(bad_clip)?;
-        let rendering = CpuEngine::default().render(&gaussians, &view.camera, sequence.settings.background);
+        let rendering = engine.render(&gaussians, &view.camera, sequence.settings.background);
         let mut image = rendering.map_err(|error| CliError::failed(&view.name, error))?.image;
         // What a viewer shows.
         image.pixels.iter_mut().for_each(|value| *value = value.clamp(0.0, 1.0));

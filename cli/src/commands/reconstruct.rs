@@ -37,7 +37,7 @@ pub(crate) struct ReconstructArgs {
 /// How a job is run on this machine.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct RunArgs {
-    /// Worker processes of one thread each; 0 waits for workers that you start [default: one per core].
+    /// Worker processes; 0 waits for workers that you start [default: one per GPU, else one of one thread per core].
     #[arg(long, value_name = "N", help_heading = "Execution")]
     pub(crate) workers: Option<usize>,
 
@@ -55,20 +55,22 @@ pub(crate) struct RunArgs {
 
 pub(super) async fn run(args: ReconstructArgs, logs: &LogArgs) -> Result<(), CliError> {
     let request = args.job.request(Some(&args.out))?;
-    let workers = args.run.workers.unwrap_or_else(cores);
-    reconstruct(request, &args.out, workers, &args.run, logs).await
+    reconstruct(request, &args.out, cores(), &args.run, logs).await
 }
 
-/// Runs a job and reports it.
+/// Runs a job and reports it; `on_cpu` is the number of workers on a machine without a GPU, unless one is given.
 pub(super) async fn reconstruct(
     request: SubmitRequest,
     output: &Path,
-    workers: usize,
+    on_cpu: usize,
     run: &RunArgs,
     logs: &LogArgs,
 ) -> Result<(), CliError> {
     let interrupted = interrupt::token()?;
-    let embedded = EmbeddedRun { output, request, workers, listen: run.listen, engine: run.engine, logs };
+    let placement = run.engine.placement()?;
+    let workers = run.engine.workers(&placement, run.workers, on_cpu, cores());
+    let engine = run.engine.engine_on(&placement)?;
+    let embedded = EmbeddedRun { output, request, workers, listen: run.listen, engine, logs };
     let outcome = embedded.run(&interrupted).await.map_err(|error| with_remedy(error, output))?;
     if run.json {
         print_json(&summary(&outcome, output))?;

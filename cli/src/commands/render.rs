@@ -3,11 +3,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use splat::{engine::Engine, raster::CpuEngine};
 use trackersplat_coordinator::assembly::sequence::Sequence;
 
 use super::eval::{read_frame, read_sequence};
-use crate::{error::CliError, stdout};
+use crate::{args::EngineArgs, error::CliError, stdout};
 
 /// Arguments of `render`.
 #[derive(Args, Debug)]
@@ -26,9 +25,13 @@ pub(crate) struct RenderArgs {
     /// PNG to write.
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
+
+    #[command(flatten)]
+    engine: EngineArgs,
 }
 
 pub(super) fn run(args: RenderArgs) -> Result<(), CliError> {
+    let engine = args.engine.engine()?;
     let sequence = read_sequence(&args.dir)?;
     let view = sequence.views.iter().find(|view| view.name == args.view).ok_or_else(|| {
         CliError::bad_input(
@@ -43,7 +46,7 @@ pub(super) fn run(args: RenderArgs) -> Result<(), CliError> {
         )
     })?;
     let gaussians = read_frame(&args.dir, frame)?;
-    let rendering = CpuEngine::default().render(&gaussians, &view.camera, sequence.settings.background);
+    let rendering = engine.render(&gaussians, &view.camera, sequence.settings.background);
     let image = rendering.map_err(|error| CliError::failed("rendering", error))?.image;
     std::fs::write(&args.out, image.encode_png())
         .map_err(|error| CliError::bad_input(args.out.display(), error))?;

@@ -1,6 +1,6 @@
 //! `worker`: computes frames for a coordinator.
 
-use std::{path::PathBuf, sync::Arc, time::Duration};
+use std::{path::PathBuf, time::Duration};
 
 use clap::Args;
 use trackersplat_worker::{Exit, WorkerError, WorkerOptions};
@@ -47,7 +47,7 @@ pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
         reconnect_for: args.reconnect_for,
         remote_blobs: args.remote_blobs,
     };
-    match trackersplat_worker::run(options, Arc::new(args.engine.engine()?), interrupt::token()?).await {
+    match trackersplat_worker::run(options, args.engine.engine()?, interrupt::token()?).await {
         Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
         Err(
             error @ (WorkerError::BadAddress(_)

@@ -26,7 +26,7 @@ impl Job {
         let progress = StageProgress::new(self, "publish");
         for &frame in &self.frames {
             let request = self.frame_job(frame, &base.blob, &views, &tracks).await?;
-            let key = frame_key(&request, &self.settings, self.hub.engine.name());
+            let key = frame_key(&request, &self.settings);
             let is_done = self.is_done(frame).await?;
             match self.held_artifact(&key).await? {
                 Some(known) if !is_done => self.reuse(&base, &request, &key, &known).await?,

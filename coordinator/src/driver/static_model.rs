@@ -6,17 +6,17 @@ use bytes::Bytes;
 use serde_json::json;
 use splat::{
     clip::{Clip, Split},
-    engine::TrainingView,
+    engine::{Engine, EngineError, TrainingView},
     formats::ply,
     gaussians::{Gaussians, validate},
     settings::{MaskUse, Settings},
-    static_model::{StaticModelInput, StaticModelProgress, reconstruct},
+    static_model::{StaticModelError, StaticModelInput, StaticModelProgress, reconstruct},
 };
 
 use super::{Job, progress::StageProgress};
 use crate::{
     failure::StageError,
-    keys::{StaticModelKey, VERSION, digest_of},
+    keys::{StaticModelKey, VERSION, digest_of, engine_key},
     store::Artifact,
 };
 
@@ -50,7 +50,7 @@ impl Job {
         let key = digest_of(&StaticModelKey {
             kind: "static model",
             version: VERSION,
-            engine: self.hub.engine.name(),
+            engine: &engine_key(self.hub.engine.as_ref()),
             clip: &self.record.clip_digest,
             key_frame: self.key_frame(),
             training_views: training.map(|view| view.name.as_str()).collect(),
@@ -72,10 +72,12 @@ impl Job {
                 last = now;
                 progress.set(now.step.into(), now.steps.into())
             };
-            let model = reconstruct(engine.as_ref(), &input, &mut on_progress)?;
+            let attempt = || reconstruct(engine.as_ref(), &input, &mut on_progress);
+            let model = despite_a_loss(engine.as_ref(), attempt)?;
             let report = json!({
                 "source": "reconstructed", "gaussians": model.len(), "sh_degree": model.sh_degree,
                 "steps": last.step, "loss": last.loss, "points": input.points.len(),
+                "device": engine.device_name().unwrap_or(engine.name()),
             });
             Ok((encode(&model, "the reconstruction")?, report.to_string()))
         };
@@ -101,6 +103,21 @@ impl Job {
     pub(super) async fn held_artifact(&self, key: &str) -> Result<Option<Artifact>, StageError> {
         let Some(artifact) = self.hub.store.artifact(key).await? else { return Ok(None) };
         Ok(self.hub.blobs.holds(&artifact.blob).await.then_some(artifact))
+    }
+}
+
+/// A second attempt where the device was lost in the first one and came back.
+fn despite_a_loss<T>(
+    engine: &dyn Engine,
+    mut attempt: impl FnMut() -> Result<T, StaticModelError>,
+) -> Result<T, StaticModelError> {
+    match attempt() {
+        Err(StaticModelError::Engine(EngineError::DeviceLost(reason))) => {
+            tracing::warn!(reason, "the static model begins again");
+            engine.check()?;
+            attempt()
+        }
+        ended => ended,
     }
 }
 
@@ -147,4 +164,42 @@ fn input(clip: &Clip, settings: &Settings) -> Result<StaticModelInput, StageErro
         seed: settings.seed,
         settings: settings.static_model.clone(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use splat::raster::CpuEngine;
+
+    use super::*;
+
+    fn lost<T>() -> Result<T, StaticModelError> {
+        Err(StaticModelError::Engine(EngineError::DeviceLost("off the bus".into())))
+    }
+
+    #[test]
+    fn a_lost_device_costs_one_attempt_and_nothing_else_is_tried_twice() {
+        let engine = CpuEngine::default();
+        let mut attempts = 0;
+        let made = despite_a_loss(&engine, || {
+            attempts += 1;
+            if attempts == 1 { lost() } else { Ok(attempts) }
+        });
+        assert_eq!(made.ok(), Some(2));
+
+        let mut attempts = 0;
+        let failed = despite_a_loss::<()>(&engine, || {
+            attempts += 1;
+            lost()
+        });
+        assert!(matches!(failed, Err(StaticModelError::Engine(EngineError::DeviceLost(_)))));
+        assert_eq!(attempts, 2);
+
+        let mut attempts = 0;
+        let refused = despite_a_loss::<()>(&engine, || {
+            attempts += 1;
+            Err(StaticModelError::BadInput("no view".into()))
+        });
+        assert!(matches!(refused, Err(StaticModelError::BadInput(_))));
+        assert_eq!(attempts, 1);
+    }
 }

@@ -108,6 +108,9 @@ pub struct FrameReport {
     pub refine_steps: u32,
     /// Mean training loss at the start and at the end of refinement.
     pub refine_loss: [f32; 2],
+    /// The device that computed it, with its driver; `cpu` for the processor. Results differ between devices by rounding.
+    #[serde(default)]
+    pub device: String,
 }
 
 /// What a frame job yields.
@@ -153,6 +156,7 @@ pub fn reconstruct_frame(
         motion: start.counts,
         orders: start.orders,
         rolled_back: start.rolled_back,
+        device: engine.device_name().unwrap_or(engine.name()).to_owned(),
         ..FrameReport::default()
     };
     advance("evaluate", 0, 1)?;

@@ -1,0 +1,143 @@
+//! `--device`: which device computes, and how a host is divided among worker processes.
+
+mod reopening;
+
+use std::{fmt, str::FromStr, sync::Arc};
+
+use splat::engine::{Engine, EngineError};
+use splat_shaders::{DeviceChoice, DeviceError, GpuDevice, GpuEngine, choose, devices, real_gpus};
+
+use self::reopening::ReopeningEngine;
+use crate::error::CliError;
+
+/// `--device` on the command line.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) enum DeviceArg {
+    /// The best GPU, else the processor.
+    #[default]
+    Auto,
+    /// The processor.
+    Cpu,
+    /// The best GPU; an error if there is none.
+    Gpu,
+    /// One of the list of `devices`, software too.
+    One(DeviceChoice),
+}
+
+/// Where work goes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Placement {
+    /// To the processor.
+    Cpu,
+    /// To these GPUs, by their numbers; at least one.
+    Gpus(Vec<usize>),
+}
+
+impl FromStr for DeviceArg {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let lower = text.trim().to_lowercase();
+        match (lower.as_str(), lower.strip_prefix("gpu:")) {
+            ("", _) => Err("a device has a name; `trackersplat devices` lists them".to_owned()),
+            ("auto", _) => Ok(Self::Auto),
+            ("cpu", _) => Ok(Self::Cpu),
+            ("gpu", _) => Ok(Self::Gpu),
+            (_, Some(number)) => match number.parse() {
+                Ok(number) => Ok(Self::One(DeviceChoice::Index(number))),
+                Err(_) => Err(format!(
+                    "'{number}' is no number of a GPU; `trackersplat devices` lists them, as gpu:0 and so on"
+                )),
+            },
+            _ => Ok(Self::One(DeviceChoice::Name(text.trim().to_owned()))),
+        }
+    }
+}
+
+impl fmt::Display for DeviceArg {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Auto => f.write_str("auto"),
+            Self::Cpu => f.write_str("cpu"),
+            Self::Gpu => f.write_str("gpu"),
+            Self::One(choice) => choice.fmt(f),
+        }
+    }
+}
+
+impl DeviceArg {
+    /// The devices that are meant, on this machine.
+    pub(crate) fn placement(&self) -> Result<Placement, CliError> {
+        let real = || real_gpus(&devices()).iter().map(|device| device.index).collect::<Vec<_>>();
+        match self {
+            Self::Cpu => Ok(Placement::Cpu),
+            Self::Auto => match real() {
+                none if none.is_empty() => Ok(Placement::Cpu),
+                gpus => Ok(Placement::Gpus(gpus)),
+            },
+            Self::Gpu => match real() {
+                none if none.is_empty() => Err(self.refused(choose(&DeviceChoice::Auto, &devices()).err())),
+                gpus => Ok(Placement::Gpus(gpus)),
+            },
+            Self::One(choice) => match choose(choice, &devices()) {
+                Ok(device) => Ok(Placement::Gpus(vec![device.index])),
+                Err(error) => Err(self.refused(Some(error))),
+            },
+        }
+    }
+
+    fn refused(&self, error: Option<DeviceError>) -> CliError {
+        let why = error.map(|error| error.to_string()).unwrap_or_default();
+        CliError::bad_input(
+            format!("--device {self}"),
+            format!("{why}; `trackersplat devices` says more, --device cpu always computes"),
+        )
+    }
+}
+
+/// An engine on a GPU that opens its device again after it was lost.
+pub(crate) fn gpu_engine(index: usize) -> Result<Arc<dyn Engine>, CliError> {
+    let open = move || -> Result<Arc<dyn Engine>, EngineError> {
+        let device = GpuDevice::open(&DeviceChoice::Index(index))
+            .map_err(|error| EngineError::DeviceLost(error.to_string()))?;
+        Ok(Arc::new(GpuEngine::new(device)?))
+    };
+    let engine = ReopeningEngine::new(Box::new(open)).map_err(|error| {
+        CliError::failed(format!("device gpu:{index}"), format!("{error}; --device cpu does without it"))
+    })?;
+    Ok(Arc::new(engine))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+
+    #[test]
+    fn a_device_reads_back_as_it_was_written() {
+        for text in ["auto", "cpu", "gpu", "gpu:3", "NVIDIA H100"] {
+            assert_eq!(text.parse::<DeviceArg>().unwrap().to_string(), text);
+        }
+        assert_eq!("GPU:3".parse(), Ok(DeviceArg::One(DeviceChoice::Index(3))));
+        assert_eq!(" Cpu ".parse(), Ok(DeviceArg::Cpu));
+    }
+
+    #[test]
+    fn what_is_no_device_is_refused_with_the_remedy() {
+        for text in ["", " ", "gpu:", "gpu:-1", "gpu:x"] {
+            let error = text.parse::<DeviceArg>().unwrap_err();
+            assert!(error.contains("trackersplat devices"), "{text}: {error}");
+        }
+        let unknown = DeviceArg::One(DeviceChoice::Name("no card has this name".to_owned()));
+        let error = unknown.placement().unwrap_err();
+        assert_eq!(error.exit_code(), 3);
+        assert!(error.to_string().contains("this machine has"), "{error}");
+    }
+
+    #[test]
+    fn the_processor_is_always_there() {
+        assert_eq!(DeviceArg::Cpu.placement().unwrap(), Placement::Cpu);
+        assert!(DeviceArg::Auto.placement().is_ok());
+    }
+}
