@@ -41,6 +41,8 @@ pub struct DeviceDescription {
     pub backend: String,
     /// Driver and its version.
     pub driver: String,
+    /// Where it sits, such as `0000:c1:00.0`; empty where the driver does not say.
+    pub pci_bus: String,
     /// Memory that jobs can have, bytes, where the driver says: a card's own, else the largest it sees. Unknown for software.
     pub memory: Option<u64>,
     /// Largest buffer that a kernel can see, bytes.
@@ -137,6 +139,7 @@ impl DeviceDescription {
             name: info.name,
             backend: info.backend.to_string(),
             driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            pci_bus: info.device_pci_bus_id,
             max_binding: adapter.limits().max_storage_buffer_binding_size,
             features: optional
                 .iter()
@@ -150,6 +153,11 @@ impl DeviceDescription {
     pub fn label(&self) -> String {
         let driver = if self.driver.is_empty() { String::new() } else { format!(", {}", self.driver) };
         format!("{} ({}{driver})", self.name, self.backend)
+    }
+
+    /// The choice of this very device, whatever its number has become.
+    pub fn itself(&self) -> DeviceChoice {
+        DeviceChoice::Itself { label: self.label(), pci_bus: self.pci_bus.clone(), index: self.index }
     }
 }
 

@@ -199,7 +199,8 @@ fn a_killed_gpu_worker_and_a_killed_coordinator_change_nothing_while_a_cpu_worke
     assert_eq!(frames.len() as u64, FRAMES);
     let attempts = |frame: u64| frames[frame as usize - 1]["attempts"].as_u64().unwrap();
     assert_eq!(attempts(2), 1, "what was done stayed done");
-    assert_eq!(attempts(3), 3, "one attempt of each that was killed, and the last: {frames:#?}");
+    // One attempt of each that was killed, and the last; a fast device may have ended it before its worker was.
+    assert!((2..=3).contains(&attempts(3)), "{frames:#?}");
     let expected: BTreeMap<&str, Vec<Vec<u8>>> = [(CPU_WORKER, "cpu"), (GPU_WORKER, argument.as_str())]
         .map(|(worker, device)| (worker, Fleet::undisturbed(worker, device)))
         .into();

@@ -237,7 +237,8 @@ impl Worker {
                         if self.acknowledge(&receipt.lease_id, receipt.accepted, &receipt.reason) {
                             if let Err(reason) = self.look_at_device().await {
                                 let goodbye = GoingAway { reason: reason.clone() };
-                                connection.send(worker_message::Message::GoingAway(goodbye))?;
+                                // A stream that breaks right now brings no device back.
+                                let _ = connection.send(worker_message::Message::GoingAway(goodbye));
                                 connection.close(FAREWELL).await;
                                 return Err(StreamEnd::Device(reason));
                             }
@@ -301,13 +302,16 @@ impl Worker {
 
     /// Whether the device is there for another frame; it may be opened again for that, which takes a while.
     async fn look_at_device(&mut self) -> Result<(), String> {
-        if !std::mem::take(&mut self.is_device_in_doubt) {
+        if !self.is_device_in_doubt {
             return Ok(());
         }
         let engine = self.engine.clone();
         let looked = tokio::task::spawn_blocking(move || engine.check()).await;
         match looked {
-            Ok(Ok(())) => Ok(()),
+            Ok(Ok(())) => {
+                self.is_device_in_doubt = false;
+                Ok(())
+            }
             Ok(Err(error)) => Err(error.to_string()),
             Err(error) => Err(format!("looking at it: {error}")),
         }

@@ -34,6 +34,9 @@ impl GpuCheck {
         let program = build()?;
         let data = self.out.join("data");
         if data.exists() {
+            if !self.out.join(PROGRAM).exists() {
+                bail!("{} is not of an earlier check; give --out a folder of its own", data.display());
+            }
             fs::remove_dir_all(&data).with_context(|| format!("cannot empty {}", data.display()))?;
         }
         let folder = if self.scene.is_empty() { &self.out } else { &data };

@@ -11,8 +11,8 @@ use anyhow::{Result, bail};
 struct Tool {
     /// Programs of which one is enough.
     programs: &'static [&'static str],
-    /// Folders of which one that is not empty is enough.
-    folders: &'static [&'static str],
+    /// Folders of which one that has a file with a name that begins so is enough.
+    folders: &'static [(&'static str, &'static str)],
     /// Packages on Debian and Ubuntu that bring one.
     packages: &'static [&'static str],
     /// What it is for.
@@ -38,9 +38,10 @@ const TOOLS: [Tool; 3] = [
     },
     Tool {
         programs: &[],
-        folders: &["/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d"],
+        folders: &[("/usr/share/vulkan/icd.d", "lvp_icd"), ("/etc/vulkan/icd.d", "lvp_icd")],
         packages: &["libvulkan1", "mesa-vulkan-drivers"],
-        purpose: "a Vulkan driver, for the tests of the GPU engine; TRACKERSPLAT_TEST_DEVICE=none skips them",
+        purpose: "software Vulkan (lavapipe), for the tests of the GPU engine; TRACKERSPLAT_TEST_DEVICE=none skips them, a \
+                  card's name runs them there",
         is_required: false,
     },
 ];
@@ -64,10 +65,12 @@ pub(crate) fn provide() -> Result<()> {
 
 impl Tool {
     fn is_there(&self) -> bool {
-        let is_filled =
-            |folder: &&str| Path::new(folder).read_dir().is_ok_and(|mut entries| entries.next().is_some());
+        let has_file = |(folder, prefix): &(&str, &str)| {
+            let mut entries = Path::new(folder).read_dir().into_iter().flatten().flatten();
+            entries.any(|entry| entry.file_name().to_string_lossy().starts_with(prefix))
+        };
         // Drivers of other systems come with them.
-        if !self.folders.is_empty() && (!cfg!(target_os = "linux") || self.folders.iter().any(is_filled)) {
+        if !self.folders.is_empty() && (!cfg!(target_os = "linux") || self.folders.iter().any(has_file)) {
             return true;
         }
         let folders = std::env::var_os("PATH").unwrap_or_default();

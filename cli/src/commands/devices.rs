@@ -149,6 +149,7 @@ mod tests {
             driver: String::new(),
             memory: None,
             max_binding: 0,
+            pci_bus: String::new(),
             features: Vec::new(),
         };
         let taken = |kinds: &[DeviceKind]| {

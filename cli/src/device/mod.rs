@@ -95,16 +95,19 @@ impl DeviceArg {
     }
 }
 
-/// An engine on a GPU that opens its device again after it was lost.
+/// An engine on a GPU that opens its device, and no other, again after it was lost.
 pub(crate) fn gpu_engine(index: usize) -> Result<Arc<dyn Engine>, CliError> {
+    let failed = |why: String| {
+        CliError::failed(format!("device gpu:{index}"), format!("{why}; --device cpu does without it"))
+    };
+    let device = choose(&DeviceChoice::Index(index), &devices())
+        .map(|device| device.itself())
+        .map_err(|error| failed(error.to_string()))?;
     let open = move || -> Result<Arc<dyn Engine>, EngineError> {
-        let device = GpuDevice::open(&DeviceChoice::Index(index))
-            .map_err(|error| EngineError::DeviceLost(error.to_string()))?;
+        let device = GpuDevice::open(&device).map_err(|error| EngineError::DeviceLost(error.to_string()))?;
         Ok(Arc::new(GpuEngine::new(device)?))
     };
-    let engine = ReopeningEngine::new(Box::new(open)).map_err(|error| {
-        CliError::failed(format!("device gpu:{index}"), format!("{error}; --device cpu does without it"))
-    })?;
+    let engine = ReopeningEngine::new(Box::new(open)).map_err(|error| failed(error.to_string()))?;
     Ok(Arc::new(engine))
 }
 

@@ -1,6 +1,6 @@
 //! Which device is meant.
 
-use std::fmt;
+use std::{collections::BTreeSet, fmt};
 
 use super::{DeviceDescription, DeviceError, DeviceKind};
 
@@ -14,6 +14,15 @@ pub enum DeviceChoice {
     /// The one of this name, else the only one whose name contains it, upper and lower case alike. A device that several
     /// drivers offer counts once.
     Name(String),
+    /// The one that was here before: numbers shift when a device falls off its bus.
+    Itself {
+        /// [`DeviceDescription::label`].
+        label: String,
+        /// [`DeviceDescription::pci_bus`].
+        pci_bus: String,
+        /// Its number then, which tells those apart that are alike in all else.
+        index: usize,
+    },
 }
 
 impl fmt::Display for DeviceChoice {
@@ -22,6 +31,8 @@ impl fmt::Display for DeviceChoice {
             Self::Auto => write!(f, "gpu"),
             Self::Index(index) => write!(f, "gpu:{index}"),
             Self::Name(name) => write!(f, "{name}"),
+            Self::Itself { label, pci_bus, .. } if pci_bus.is_empty() => write!(f, "{label}"),
+            Self::Itself { label, pci_bus, .. } => write!(f, "{label} at {pci_bus}"),
         }
     }
 }
@@ -33,7 +44,12 @@ pub fn real_gpus(devices: &[DeviceDescription]) -> Vec<&DeviceDescription> {
     let Some((_, _, best)) = ranked.min_by_key(|(preference, index, _)| (*preference, *index)) else {
         return Vec::new();
     };
-    devices.iter().filter(|device| device.kind == best.kind && device.backend == best.backend).collect()
+    let mut places = BTreeSet::new();
+    devices
+        .iter()
+        .filter(|device| device.kind == best.kind && device.backend == best.backend)
+        .filter(|device| device.pci_bus.is_empty() || places.insert(&device.pci_bus))
+        .collect()
 }
 
 /// The device that a choice means.
@@ -45,6 +61,10 @@ pub fn choose<'a>(
         DeviceChoice::Auto => real_gpus(devices).first().copied(),
         DeviceChoice::Index(index) => devices.get(*index),
         DeviceChoice::Name(name) => named(name, devices)?,
+        DeviceChoice::Itself { label, pci_bus, index } => {
+            let same = devices.iter().filter(|device| device.label() == *label && device.pci_bus == *pci_bus);
+            same.min_by_key(|device| device.index.abs_diff(*index))
+        }
     };
     found.ok_or_else(|| DeviceError::NotFound { choice: choice.clone(), found: listed(devices) })
 }
@@ -95,6 +115,7 @@ mod tests {
             kind,
             backend: "vulkan".to_owned(),
             driver: String::new(),
+            pci_bus: String::new(),
             memory: None,
             max_binding: 0,
             features: Vec::new(),
@@ -151,6 +172,32 @@ mod tests {
         assert_eq!(chosen(&by_name("card"), &all), Some(0));
         assert_eq!(real_gpus(&all).len(), 1);
         assert_eq!(chosen(&DeviceChoice::Index(1), &all), Some(1));
+        let at = |index, driver: &str, pci_bus: &str| DeviceDescription {
+            driver: driver.to_owned(),
+            pci_bus: pci_bus.to_owned(),
+            ..device(index, "Card A", DeviceKind::Discrete)
+        };
+        let twice =
+            [at(0, "one", "0000:01:00.0"), at(1, "other", "0000:01:00.0"), at(2, "one", "0000:02:00.0")];
+        let cards: Vec<_> = real_gpus(&twice).iter().map(|device| device.index).collect();
+        assert_eq!(cards, [0, 2]);
+    }
+
+    #[test]
+    fn a_device_is_found_again_under_another_number_and_no_other_in_its_place() {
+        let at = |index, pci_bus: &str| DeviceDescription {
+            pci_bus: pci_bus.to_owned(),
+            ..device(index, "Card A", DeviceKind::Discrete)
+        };
+        let before =
+            [at(0, "0000:01:00.0"), at(1, "0000:02:00.0"), device(2, "llvmpipe", DeviceKind::Software)];
+        let after = [at(0, "0000:02:00.0"), device(1, "llvmpipe", DeviceKind::Software)];
+        assert_eq!(chosen(&before[1].itself(), &after), Some(0));
+        assert_eq!(chosen(&before[0].itself(), &after), None, "its neighbour is not it");
+        assert_eq!(chosen(&before[2].itself(), &after), Some(1));
+        // Where drivers say no bus the number is all there is.
+        let silent = [at(0, ""), at(1, "")];
+        assert_eq!(chosen(&silent[1].itself(), &silent), Some(1));
     }
 
     #[test]
