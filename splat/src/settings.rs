@@ -100,6 +100,33 @@ pub(crate) mod range {
         Err(D::Error::custom(format!("{value} is not between 0 and 1")))
     }
 
+    /// A share in double precision: 0 to 1.
+    pub(crate) fn share<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+        let value = f64::deserialize(from)?;
+        if (0.0..=1.0).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not between 0 and 1")))
+    }
+
+    /// A size, a deviation or a significance: 0 to 1e30.
+    pub(crate) fn magnitude<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+        let value = f64::deserialize(from)?;
+        if (0.0..=1e30).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value:?} is not between 0 and 1e30")))
+    }
+
+    /// A number of views, neighbours or rounds: at most a thousand.
+    pub(crate) fn few<'de, D: Deserializer<'de>>(from: D) -> Result<usize, D::Error> {
+        let value = usize::deserialize(from)?;
+        if value <= 1000 {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is more than 1000")))
+    }
+
     /// A number of steps: at most a million.
     pub(crate) fn steps<'de, D: Deserializer<'de>>(from: D) -> Result<u32, D::Error> {
         let value = u32::deserialize(from)?;
@@ -149,6 +176,10 @@ mod tests {
             (r#"{"refine":{"dssim_weight":1.5}}"#, "1.5"),
             (r#"{"refine":{"mean_rate":-0.1}}"#, "-0.1"),
             (r#"{"static_model":{"max_gaussians":0}}"#, "0 is not"),
+            (r#"{"motion":{"static_share":-0.5}}"#, "-0.5"),
+            (r#"{"motion":{"max_log_strain":-0.2}}"#, "-0.2"),
+            (r#"{"motion":{"expected_strain":1e300}}"#, "1e300"),
+            (r#"{"motion":{"neighbours":100000}}"#, "100000"),
             (r#"{"static_model":{"random_points":1000000000000}}"#, "1000000000000"),
             (r#"{"static_model":{"sh_degree":4}}"#, "degree 4"),
         ] {

@@ -4,7 +4,7 @@ use glam::{DMat2, DVec2};
 
 use super::{
     MotionSettings,
-    moments::{Displacements, FootprintMoments},
+    moments::{Displacements, FootprintMoments, trace},
     order::{Candidates, Order},
 };
 
@@ -21,9 +21,10 @@ const LEAST_KEPT: f64 = 0.01;
 /// How much the variance of tracks may exceed their claim, where no other surface explains it, before a footprint counts
 /// as moving: twice the deviations.
 const MOST_EXCESS: f64 = 4.0;
-/// px², far below any pixel's size: where a footprint has no extent its affine map is known to nothing instead of infinitely
-/// badly.
-const LEAST_EXTENT: f64 = 1e-9;
+/// px²: what the sums may err by in the narrow direction of a footprint. One that is no wider has no affine map.
+const LEAST_EXTENT: f64 = 1e-5;
+/// Effective pixels below which a footprint cannot show two surfaces.
+const LEAST_CONTESTED: f64 = 4.0;
 
 /// How a footprint moves: `x ↦ target + gradient · (x − m)` about the projected mean `m`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,11 +71,12 @@ pub(super) fn fit(
     // claims.
     let claimed = footprint.track_variance;
     let first = Candidates::new(&footprint, ridge(claimed, independent_pixels, settings));
-    let found = residual_variance(first.affine_residual_power(), footprint.pixels) / contest.kept;
-    let noise = claimed.max(found);
+    let noise =
+        claimed.max(contest.noise(residual_variance(first.affine_residual_power(), footprint.pixels)));
     let ridge = ridge(noise, independent_pixels, settings);
     let candidates = Candidates::new(&footprint, ridge);
-    let has_extent = footprint.source.determinant() >= settings.min_footprint_area.powi(2);
+    let rounding = LEAST_EXTENT * trace(footprint.source);
+    let has_extent = footprint.source.determinant() >= settings.min_footprint_area.powi(2).max(rounding);
     let order = match has_extent {
         true => candidates.select(noise, independent_pixels),
         false => Order::Translation,
@@ -101,7 +103,11 @@ pub(super) fn fit(
         && displacement.length_squared() <= still
         && candidates.is_rigid(resting, independent_pixels, settings);
 
-    let extent = footprint.source + DMat2::from_diagonal(DVec2::splat(LEAST_EXTENT));
+    let extent = match has_extent {
+        true => footprint.source,
+        false => DMat2::from_diagonal(DVec2::splat(LEAST_EXTENT)),
+    };
+    let strain = if has_extent { footprint.strain * extent.inverse() } else { DMat2::ZERO };
     let fit = Fit {
         target: projected_mean + displacement,
         variance: variance + floor + wrong_surface,
@@ -109,7 +115,7 @@ pub(super) fn fit(
         doubt: if contest.kept > 0.5 { wrong_surface / total } else { 0.0 },
         order: if is_static { Order::Static } else { order },
         gradient: DMat2::IDENTITY + candidates.gradient(order),
-        affine: DMat2::IDENTITY + footprint.strain * extent.inverse(),
+        affine: DMat2::IDENTITY + strain,
         affine_covariance: extent.inverse() * pixel_variance,
     };
     fit.is_finite().then_some(fit)
@@ -138,8 +144,15 @@ impl Contest {
     fn of(moments: &FootprintMoments, footprint: &Displacements) -> Self {
         // `Σ w σ²` with `w = alpha T / σ²` is a sum of blending weights.
         let kept = (moments.variance / moments.visible).clamp(LEAST_KEPT, 1.0);
-        let after = 0.5 * footprint.affine_residual_power();
-        Self { kept, before: moments.contest, between: (moments.contest - after / kept).max(0.0) }
+        let after = residual_variance(footprint.affine_residual_power(), footprint.pixels);
+        let between = if footprint.pixels < LEAST_CONTESTED { 0.0 } else { moments.contest - after / kept };
+        Self { kept, before: moments.contest, between: between.max(0.0) }
+    }
+
+    /// Variance of the tracks if they leave `residual` after reweighting: as much more as the weights took from it, but no
+    /// more than there was. What turns or grows loses weight by its strain too.
+    fn noise(&self, residual: f64) -> f64 {
+        if self.before > 0.0 { (residual / self.kept).min(self.before.max(residual)) } else { residual }
     }
 
     fn is_contested(&self) -> bool {

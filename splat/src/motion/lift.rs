@@ -83,6 +83,11 @@ pub(super) fn at_rest(
     Problem { sightings, mean, settings }.lift(mean, voters)
 }
 
+/// How many sightings agree with an unchanged position, by the measure of [`solve`].
+pub(super) fn agreeing_at_rest(sightings: &[Sighting<'_>], mean: DVec3, settings: &MotionSettings) -> usize {
+    Problem { sightings, mean, settings }.inliers(mean).len()
+}
+
 #[derive(Clone, Copy)]
 struct Problem<'a> {
     sightings: &'a [Sighting<'a>],
@@ -258,7 +263,7 @@ impl Problem<'_> {
             return None;
         }
         let information = self.information(position, &inliers);
-        let depth = self.sightings[inliers[0]].camera.to_camera(position).z;
+        let depth = self.sightings[*inliers.first()?].camera.to_camera(position).z;
         let least = (self.settings.max_relative_deviation * depth).powi(-2);
         let are_enough = inliers.len() >= self.settings.min_views.max(2);
         let is_determined = are_enough && is_above(information, least);

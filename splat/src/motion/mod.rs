@@ -82,7 +82,8 @@ pub struct MotionField {
     pub rotation: Vec<glam::DQuat>,
     /// How each motion was found.
     pub origin: Vec<MotionOrigin>,
-    /// Information matrix of each translation, 1 / world unit²: zero where nothing was observed.
+    /// Information matrix of each translation, 1 / world unit², from the views that agree with it: of Gaussians at rest those
+    /// that find them so. Zero where nothing was observed, and singular where the views do not determine a position.
     pub information: Vec<glam::DMat3>,
     /// Whether the spherical harmonics turn with the Gaussians.
     pub turns_harmonics: bool,
@@ -177,11 +178,11 @@ fn estimate_in_order(
     turn_solved(&mut states, &observations, views, &context);
     entered(MotionStage::Propagate);
     propagate::propagate(&mut states, &context);
-    let has_accepted = propagate::accept_doubted(&mut states);
-    if has_accepted {
+    if propagate::accept_doubted(&mut states) {
         turn_solved(&mut states, &observations, views, &context);
+        propagate::propagate(&mut states, &context);
     }
-    if propagate::accept_resting(&mut states) || has_accepted {
+    if propagate::accept_resting(&mut states) {
         propagate::propagate(&mut states, &context);
     }
     entered(MotionStage::Regularise);
@@ -211,12 +212,13 @@ fn solve_alone(
         let origin = if is_determined { MotionOrigin::Static } else { MotionOrigin::Unsolved };
         State { is_seen_at_rest: true, ..State::unmoved(origin, own) }
     };
+    let agreeing = || lift::agreeing_at_rest(&sightings, mean, settings);
     let lift = || lift::solve(&sightings, mean, settings);
     let voters = static_test::voters_for_rest(observations, settings);
     let lift = match voters {
         None => lift(),
         Some(voters) if voters.len() == observations.len() => return resting(voters),
-        Some(voters) => match lift().filter(|lift| static_test::refutes(lift, voters.len(), settings)) {
+        Some(voters) => match lift().filter(|lift| static_test::refutes(lift, agreeing(), settings)) {
             None => return resting(voters),
             moved => moved,
         },

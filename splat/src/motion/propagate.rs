@@ -84,15 +84,19 @@ impl Context<'_> {
     /// Followers turn as those whom they follow do on average, give or take the strain of a neighbourhood, unless the
     /// displacements say otherwise: of few neighbours, or of those in a line, these do not determine a rotation.
     fn expectation(&self, consensus: &Consensus, states: &[State]) -> Expectation {
+        let deviation = self.settings.neighbour_strain;
         let mut mean = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0);
         for member in &consensus.members {
             let turn = states[member.index].rotation;
             // `q` and `-q` are the same rotation.
             let side = if mean.dot(turn) < 0.0 { -1.0 } else { 1.0 };
-            mean = mean + turn * (side * member.affinity);
+            let error = states[member.index].rotation_error;
+            let error = error.x_axis.x + error.y_axis.y + error.z_axis.z + deviation * deviation;
+            mean = mean + turn * (side * member.affinity / error.max(f64::MIN_POSITIVE));
         }
-        let rotation = if mean.length_squared() > 0.0 { mean.normalize() } else { DQuat::IDENTITY };
-        let deviation = self.settings.neighbour_strain;
+        let is_turned = mean.xyz() != DVec3::ZERO && mean.length_squared() > 0.0 && mean.is_finite();
+        let rotation = if is_turned { mean.normalize() } else { DQuat::IDENTITY };
+
         Expectation { translation: consensus.translation, rotation, deviation }
     }
 
@@ -178,7 +182,7 @@ fn deviation(state: &State) -> f64 {
 /// knows better; whether there are any.
 pub(super) fn accept_doubted(states: &mut [State]) -> bool {
     let mut any = false;
-    for state in states.iter_mut().filter(|state| state.origin == MotionOrigin::Unsolved) {
+    for state in states.iter_mut().filter(|state| !state.is_known() && !state.is_seen_at_rest) {
         if let Some(own) = state.own.take_if(|own| own.is_determined_if_undoubted) {
             let solved = State::unmoved(MotionOrigin::Solved, None);
             *state = State { translation: own.translation, own: Some(own), ..solved };

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::settings::Quality;
+use crate::settings::{Quality, range};
 
 /// Which path leads from footprints to motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,82 +27,109 @@ pub struct MotionSettings {
     pub lift: LiftMethod,
     /// Least sum of blending weights `alpha * T` of a footprint that counts as observed in a view; default
     /// 1e-3, as in the public code.
+    #[serde(deserialize_with = "range::magnitude")]
     pub min_blend_weight: f64,
     /// Least number of visible pixels of a footprint that counts as observed; default 2, as in the public
     /// code.
     pub min_pixels: u32,
     /// Least `√det` of a footprint's covariance, px², for a model beyond a translation; default 0.06, what the public
     /// code asks for at 640×360.
+    #[serde(deserialize_with = "range::magnitude")]
     pub min_footprint_area: f64,
     /// Least visible share of a footprint's blending weight, 0 to 1; default 0.6. Where most of it vanishes,
     /// what remains is likely another surface at its rim.
+    #[serde(deserialize_with = "range::share")]
     pub min_visible_share: f64,
     /// Least mean transmittance before a Gaussian, relative to the view that sees it best, 0 to 1; default
     /// 0.1. Pixels in front of a hidden Gaussian track its occluder.
+    #[serde(deserialize_with = "range::share")]
     pub min_relative_transmittance: f64,
     /// Least number of views that a position is solved from; default 2, as in the paper. A single view still
     /// counts along the directions it sees once neighbours give the depth.
+    #[serde(deserialize_with = "range::few")]
     pub min_views: usize,
     /// Passes over the pixels that fit footprints of two surfaces again with robust weights; default 3, `draft`
     /// 1. Zero trusts every visible track alike.
+    #[serde(deserialize_with = "range::steps")]
     pub reweighting_passes: u32,
-    /// Expected change of a footprint's shape, standard deviation of `A - I`; default 0.3. Ties the affine
-    /// fit of small or noisy footprints to a translation.
+    /// Expected change of a footprint's shape, standard deviation of `A - I`; default 0.3. Ties the displacement of small or
+    /// noisy footprints to a translation; rotation and scale are found without it.
+    #[serde(deserialize_with = "range::magnitude")]
     pub expected_strain: f64,
     /// Area over which track errors are alike, px², at least 1; default 16, the 4×4 px that dense trackers
     /// match on after densification.
+    #[serde(deserialize_with = "range::magnitude")]
     pub noise_correlation_area: f64,
     /// Standard deviation, px, of what no track sees: mixed surfaces and pixel rounding; default 0.05.
+    #[serde(deserialize_with = "range::magnitude")]
     pub noise_floor: f64,
     /// Displacement, px, below which a footprint does not move whatever the noise; default 0.2, as in the
     /// public code.
+    #[serde(deserialize_with = "range::magnitude")]
     pub static_floor: f64,
-    /// Displacement over the standard deviation that the tracks claim below which a footprint does not move;
-    /// default 3, which 1 % of resting footprints exceed; most views of a Gaussian must for it to count as moving. A
-    /// strain of the same significance is motion too.
+    /// Displacement over its standard deviation below which a footprint does not move; default 3, which 1 % of resting
+    /// footprints exceed. The deviation is what the tracks claim, up to twice that where the residual says so. A strain of
+    /// the same significance is motion too.
+    #[serde(deserialize_with = "range::magnitude")]
     pub static_significance: f64,
-    /// Share of the observing views, weighted by how well they see it, that must find a Gaussian at rest;
-    /// default 0.5.
+    /// Share of the observing views, weighted by how well they see it, that must find a Gaussian at rest; default 0.5. A
+    /// motion beyond doubt that explains more views refutes them.
+    #[serde(deserialize_with = "range::share")]
     pub static_share: f64,
     /// Reprojection error over its standard deviation beyond which a view is an outlier; default 4.
+    #[serde(deserialize_with = "range::magnitude")]
     pub outlier_significance: f64,
     /// Reprojection error, px, that is never an outlier; default 1: a Gaussian's mean lies off the tracked
     /// surface.
+    #[serde(deserialize_with = "range::magnitude")]
     pub outlier_floor: f64,
     /// Largest standard deviation of a position that a Gaussian's own views determine, be it at rest or not, as a share of its
     /// depth; default 0.02. Beyond it the
     /// neighbours decide: footprints that straddle two motions know neither.
+    #[serde(deserialize_with = "range::magnitude")]
     pub max_relative_deviation: f64,
     /// Expected rotation, standard deviation in radians; default 1. Ties weakly determined rotations to none.
+    #[serde(deserialize_with = "range::magnitude")]
     pub expected_rotation: f64,
-    /// Rotation over its standard deviation below which a Gaussian does not turn; larger rotations shrink by
-    /// the same share of their square. Default 3 (3 % of unturned Gaussians exceed it in three dimensions).
+    /// Rotation over its standard deviation below which a Gaussian does not turn; larger ones, `s` times as significant, keep
+    /// `1 - s⁻⁴` of themselves. Default 3 (3 % of unturned Gaussians exceed it in three dimensions).
+    #[serde(deserialize_with = "range::magnitude")]
     pub rotation_significance: f64,
     /// Stretch of an axis over its standard deviation below which a Gaussian keeps its scale; default 4: a wrong
     /// scale costs more than a missing one.
+    #[serde(deserialize_with = "range::magnitude")]
     pub scale_significance: f64,
     /// Largest change of the logarithm of a scale; default 0.2.
+    #[serde(deserialize_with = "range::magnitude")]
     pub max_log_strain: f64,
     /// Nearest neighbours per Gaussian; default 12, `draft` 8 (the paper's).
+    #[serde(deserialize_with = "range::few")]
     pub neighbours: usize,
     /// Longest edge between neighbours, in medians of the distance to the farthest of the nearest neighbours;
     /// default 8.
+    #[serde(deserialize_with = "range::magnitude")]
     pub max_edge: f64,
     /// Expected departure of neighbours from moving as one rigid body, as a share of their distance; default
     /// 0.1.
+    #[serde(deserialize_with = "range::magnitude")]
     pub neighbour_strain: f64,
     /// Colour difference between neighbours that halves their tie, as a distance in the sRGB cube; default
     /// 0.4, because texture differs within a body too.
+    #[serde(deserialize_with = "range::magnitude")]
     pub colour_scale: f64,
     /// Longest chain of neighbours along which an unobserved Gaussian takes its motion; default 30: the
     /// whole of a body, as what stays behind at its old place shows.
+    #[serde(deserialize_with = "range::few")]
     pub max_hops: usize,
     /// Agreeing neighbours that an unobserved Gaussian needs to follow them; default 1.
+    #[serde(deserialize_with = "range::few")]
     pub min_support: usize,
     /// Rounds of robust reweighting of the neighbours' field; default 3, `draft` 2. Zero leaves the solved
     /// motions as they are.
+    #[serde(deserialize_with = "range::few")]
     pub field_rounds: usize,
     /// Most steps of conjugate gradients per round; default 20.
+    #[serde(deserialize_with = "range::few")]
     pub field_steps: usize,
 }
 

@@ -22,12 +22,12 @@ pub(super) fn voters_for_rest(observations: &[Observation], settings: &MotionSet
     (all > 0.0 && at_rest > settings.static_share * all).then_some(voters)
 }
 
-/// Whether a solved position explains more views than rest, by a motion beyond doubt: what moves along the rays of most
-/// views moves for the others.
-pub(super) fn refutes(lift: &Lift, voters: usize, settings: &MotionSettings) -> bool {
+/// Whether a solved position explains more views than the `resting` that rest explains, by a motion beyond doubt: what moves
+/// along the rays of most views moves for the others.
+pub(super) fn refutes(lift: &Lift, resting: usize, settings: &MotionSettings) -> bool {
     let chi_squared = lift.translation.dot(lift.information * lift.translation);
     // Three components instead of the two of a displacement, of a Gaussian that most views see at rest: noise alone exceeds
     // twice the square of 3 in 0.04 % of them.
     let is_significant = chi_squared > 2.0 * settings.static_significance.powi(2);
-    lift.is_determined && lift.inliers.len() > voters && is_significant
+    lift.is_determined && lift.inliers.len() > resting && is_significant
 }

@@ -62,3 +62,51 @@ fn motion_along_the_only_ray_is_left_to_neighbours() {
     // A quarter of the motion; a frozen wall would be off by all of it.
     assert!(errors[errors.len() / 2] < 0.01, "median error {}", errors[errors.len() / 2]);
 }
+
+#[test]
+fn a_few_biased_views_move_nobody() {
+    let gaussians = corner(90, 54);
+    let mut views = views(&cameras(12), |x| x, 0.05);
+    for view in views.iter_mut().rev().take(3) {
+        for [x, y] in &mut Arc::make_mut(&mut view.tracks).positions {
+            (*x, *y) = (*x + 0.35, *y - 0.2);
+        }
+    }
+    let field = estimated(&gaussians, &views, &settings());
+    assert!(share(&field, MotionOrigin::Static) > 0.98, "{}", share(&field, MotionOrigin::Static));
+}
+
+#[test]
+fn what_most_views_see_along_their_rays_moves_for_the_others() {
+    let gaussians = corner(150, 55);
+    let rig = cameras(6);
+    // Two thirds of the cameras stand in one place.
+    let rig = [0, 0, 0, 0, 2, 5].map(|k| rig[k].clone());
+    let forward = rig[0].rotation.transpose() * DVec3::Z;
+    let field = estimated(&gaussians, &views(&rig, |x| x + forward * 0.06, 0.05), &settings());
+    let resting = share(&field, MotionOrigin::Static);
+    assert!(resting < 0.05, "{resting} at rest");
+}
+
+#[test]
+fn turning_footprints_of_noisier_tracks_than_claimed_keep_most_of_their_information() {
+    let mut gaussians = corner(60, 56);
+    gaussians.log_scales.iter_mut().for_each(|scales| *scales = [0.15f32.ln(), 0.15f32.ln(), 1e-3f32.ln()]);
+    let truth = Rigid { turn: DQuat::from_rotation_z(0.25), shift: DVec3::ZERO };
+    let claimed = |claim: f32| {
+        let mut views = views(&cameras(6), |x| truth.of(x), 0.25);
+        scenes::add_noise(&mut views, 0.25, 57);
+        for view in &mut views {
+            Arc::make_mut(&mut view.tracks).sigma.fill(claim);
+        }
+        super::super::observe::observe(&CpuEngine::default(), &gaussians, &views, &settings()).unwrap()
+    };
+    let median = |observed: Vec<Vec<super::super::observe::Observation>>| {
+        let mut all: Vec<f64> = observed.iter().flatten().map(|seen| seen.fit.variance).collect();
+        all.sort_by(f64::total_cmp);
+        all[all.len() / 2]
+    };
+    let (honest, modest) = (median(claimed(0.25)), median(claimed(0.1)));
+    // Reweighting takes pixels that turning moves off the mean for another surface's, two in three; the noise stays.
+    assert!(modest < 4.0 * honest, "variance {modest} px² instead of {honest} px²");
+}
