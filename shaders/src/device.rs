@@ -42,7 +42,7 @@ pub struct DeviceDescription {
     pub driver: String,
     /// Largest buffer that a kernel can see, bytes.
     pub max_binding: u64,
-    /// Optional capabilities that faster kernels could use: `subgroup`, `f16`, `int64`, `timestamps`.
+    /// Optional capabilities: `subgroup` and `timestamps` are used where they are; `f16` and `int64` are told only.
     pub features: Vec<&'static str>,
 }
 
@@ -165,6 +165,7 @@ pub struct GpuDevice {
     description: DeviceDescription,
     limits: Limits,
     memory_limit: Option<u64>,
+    has_base_kernels: bool,
     fault: Arc<Mutex<Fault>>,
 }
 
@@ -193,8 +194,8 @@ impl GpuDevice {
         };
         let descriptor = DeviceDescriptor {
             label: Some("trackersplat"),
-            // For figures only: no kernel needs them.
-            required_features: adapter.features() & Features::TIMESTAMP_QUERY,
+            // What there is of them: timestamps are for figures only, and no stage needs subgroups.
+            required_features: adapter.features() & (Features::TIMESTAMP_QUERY | Features::SUBGROUP),
             required_limits: limits.clone(),
             ..Default::default()
         };
@@ -212,12 +213,23 @@ impl GpuDevice {
             let mut fault = failed.lock().unwrap_or_else(PoisonError::into_inner);
             fault.error.get_or_insert(error.to_string());
         }));
-        Ok(Self { device, queue, description, limits, memory_limit: None, fault })
+        Ok(Self { device, queue, description, limits, memory_limit: None, has_base_kernels: false, fault })
     }
 
     /// Lets jobs take so many bytes at most; without it, jobs take what the driver grants, which it does not tell before.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
         Self { memory_limit: Some(bytes), ..self }
+    }
+
+    /// Keeps to the kernels that every device can run. The results are the same to the byte; this is for comparing times,
+    /// and for a driver whose subgroups are broken.
+    pub fn with_base_kernels(self) -> Self {
+        Self { has_base_kernels: true, ..self }
+    }
+
+    /// Whether stages run in their form for subgroups.
+    pub fn uses_subgroups(&self) -> bool {
+        self.device.features().contains(Features::SUBGROUP) && !self.has_base_kernels
     }
 
     /// See [`GpuDevice::with_memory_limit`].

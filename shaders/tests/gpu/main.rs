@@ -12,3 +12,4 @@ mod probe;
 mod scenes;
 mod session;
 mod support;
+mod variants;
