@@ -47,7 +47,7 @@ pub struct DeviceDescription {
     pub memory: Option<u64>,
     /// Largest buffer that a kernel can see, bytes.
     pub max_binding: u64,
-    /// Optional capabilities that faster kernels could use: `subgroup`, `f16`, `int64`, `timestamps`.
+    /// Optional capabilities: `subgroup` and `timestamps` are used where they are; `f16` and `int64` are told only.
     pub features: Vec<&'static str>,
 }
 
@@ -216,6 +216,7 @@ pub struct GpuDevice {
     label: String,
     limits: Limits,
     memory_limit: Option<u64>,
+    has_base_kernels: bool,
     fault: Arc<Mutex<Fault>>,
 }
 
@@ -242,8 +243,8 @@ impl GpuDevice {
         };
         let descriptor = DeviceDescriptor {
             label: Some("trackersplat"),
-            // For figures only: no kernel needs them.
-            required_features: adapter.features() & Features::TIMESTAMP_QUERY,
+            // What there is of them: timestamps are for figures only, and no stage needs subgroups.
+            required_features: adapter.features() & (Features::TIMESTAMP_QUERY | Features::SUBGROUP),
             required_limits: limits.clone(),
             ..Default::default()
         };
@@ -262,13 +263,24 @@ impl GpuDevice {
             fault.error.get_or_insert(error.to_string());
         }));
         let (label, memory_limit) = (description.label(), description.memory);
-        Ok(Self { device, queue, description, label, limits, memory_limit, fault })
+        Ok(Self { device, queue, description, label, limits, memory_limit, has_base_kernels: false, fault })
     }
 
     /// Lets jobs take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where that is not
     /// known, for what the driver grants, which it does not tell before.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
         Self { memory_limit: Some(bytes), ..self }
+    }
+
+    /// Keeps to the kernels that every device can run. The results are the same to the byte; this is for comparing times,
+    /// and for a driver whose subgroups are broken.
+    pub fn with_base_kernels(self) -> Self {
+        Self { has_base_kernels: true, ..self }
+    }
+
+    /// Whether stages run in their form for subgroups.
+    pub fn uses_subgroups(&self) -> bool {
+        self.device.features().contains(Features::SUBGROUP) && !self.has_base_kernels
     }
 
     /// See [`GpuDevice::with_memory_limit`].

@@ -40,7 +40,7 @@ pub struct GpuEngine {
 impl GpuEngine {
     /// Compiles the kernels for a device.
     pub fn new(device: GpuDevice) -> Result<Self, EngineError> {
-        let kernels = Kernels::new(&device.device);
+        let kernels = Kernels::new(&device.device, device.uses_subgroups());
         device.check()?;
         Ok(Self { context: Arc::new(Context { device, kernels }) })
     }

@@ -6,7 +6,8 @@
 //! work is a tile of 16 × 16 pixels.
 //!
 //! Every sum has a fixed order, so the same input gives the same bytes on the same device. Kernels ask for nothing beyond
-//! WebGPU's default limits and assume no subgroup size.
+//! WebGPU's default limits. Where a device has subgroups, of whatever size, some stages run in a faster form that gives the
+//! same bytes.
 
 // Tests of the crate and of its public side share their support.
 #[cfg(test)]

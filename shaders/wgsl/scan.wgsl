@@ -3,6 +3,7 @@
 // Sums are saturated, so that a list too long for 32 bits is seen as too long.
 
 #import types::{State, group_number}
+#import group_scan::{THREADS, seat_of, saturated, scan_threads}
 
 // What is summed up.
 struct ScanSettings {
@@ -15,10 +16,7 @@ struct ScanSettings {
 @group(0) @binding(2) var<storage, read_write> values: array<u32>;
 @group(0) @binding(3) var<storage, read_write> sums: array<u32>;
 
-const THREADS: u32 = 256u;
 const BLOCK: u32 = 1024u;
-
-var<workgroup> partial: array<u32, THREADS>;
 
 fn length() -> u32 {
     switch settings.list {
@@ -28,41 +26,19 @@ fn length() -> u32 {
     }
 }
 
-fn saturated(a: u32, b: u32) -> u32 {
-    return a + min(b, 0xffffffffu - a);
-}
-
-// Sum of the values of all threads before this one; `partial[THREADS - 1]` holds the sum of all afterwards.
-fn scan_threads(thread: u32, value: u32) -> u32 {
-    partial[thread] = value;
-    workgroupBarrier();
-    for (var stride = 1u; stride < THREADS; stride *= 2u) {
-        var before = 0u;
-        if thread >= stride {
-            before = partial[thread - stride];
-        }
-        workgroupBarrier();
-        partial[thread] = saturated(partial[thread], before);
-        workgroupBarrier();
-    }
-    if thread == 0u {
-        return 0u;
-    }
-    return partial[thread - 1u];
-}
-
 @compute @workgroup_size(THREADS)
 fn reduce(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    @builtin(local_invocation_index) local_index: u32,
 ) {
     let block = group_number(group, groups);
     let end = length();
     if block * BLOCK >= end {
         return;
     }
-    let first = block * BLOCK + 4u * thread;
+    let seat = seat_of(local_index);
+    let first = block * BLOCK + 4u * seat.number;
     var own = vec4(0u);
     for (var i = 0u; i < 4u; i++) {
         if first + i < end {
@@ -71,35 +47,36 @@ fn reduce(
     }
     let two = saturated(own.x, own.y);
     let three = saturated(two, own.z);
-    let before = scan_threads(thread, saturated(three, own.w));
+    let scan = scan_threads(seat, saturated(three, own.w));
+    let before = scan.before;
     let exclusive = vec4(before, saturated(before, own.x), saturated(before, two), saturated(before, three));
     for (var i = 0u; i < 4u; i++) {
         if first + i < end {
             values[first + i] = exclusive[i];
         }
     }
-    if thread == THREADS - 1u {
-        sums[block] = partial[THREADS - 1u];
+    if seat.number == 0u {
+        sums[block] = scan.total;
     }
 }
 
 // One workgroup, however many blocks.
 @compute @workgroup_size(THREADS)
-fn spine(@builtin(local_invocation_index) thread: u32) {
+fn spine(@builtin(local_invocation_index) local_index: u32) {
     let blocks = (length() + BLOCK - 1u) / BLOCK;
+    let seat = seat_of(local_index);
     var carry = 0u;
     for (var first = 0u; first < blocks; first += THREADS) {
-        let place = first + thread;
+        let block = first + seat.number;
         var value = 0u;
-        if place < blocks {
-            value = sums[place];
+        if block < blocks {
+            value = sums[block];
         }
-        let before = scan_threads(thread, value);
-        if place < blocks {
-            sums[place] = saturated(carry, before);
+        let scan = scan_threads(seat, value);
+        if block < blocks {
+            sums[block] = saturated(carry, scan.before);
         }
-        carry = saturated(carry, partial[THREADS - 1u]);
-        workgroupBarrier();
+        carry = saturated(carry, scan.total);
     }
 }
 

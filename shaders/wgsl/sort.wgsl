@@ -3,6 +3,7 @@
 // neighbouring places is then written by neighbouring threads.
 
 #import types::{State, group_number}
+#import group_scan::{THREADS, Seat, seat_of, scan_threads}
 
 struct SortSettings {
     // 0: as many keys as Gaussians, 1: as many as intersections.
@@ -21,7 +22,6 @@ struct SortSettings {
 @group(0) @binding(6) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(7) var<storage, read_write> values_out: array<u32>;
 
-const THREADS: u32 = 256u;
 const BLOCK: u32 = 1024u;
 
 fn length() -> u32 {
@@ -59,44 +59,27 @@ fn histogram(
 }
 
 // Row `d % 8`, column by thread: how many of the thread's items have half digit d, in the lower half of the word for d < 8
-// and in the upper half for the others. After `scan_ranks`, how many items of the threads before.
+// and in the upper half for the others. After `scan_ranks`, where the thread's first item of that half digit goes.
 var<workgroup> ranks: array<u32, 2048>;
-var<workgroup> parts: array<u32, THREADS>;
-// Where each half digit, then each digit starts.
+// Where each digit starts.
 var<workgroup> starts: array<u32, 256>;
 // The block's items in the order so far: digit in the upper half, place within the block in the lower half.
 var<workgroup> items: array<u32, BLOCK>;
 
-// Sums up each row of `ranks` and fills the first sixteen `starts`: a thread takes eight neighbours, thirty-two threads a row.
-fn scan_ranks(thread: u32) {
-    let first = 8u * thread;
+// Sums up all of `ranks`, a thread eight neighbours: no half of a word exceeds the 1024 items of the block.
+fn scan_ranks(seat: Seat) {
+    let first = 8u * seat.number;
     var sum = 0u;
     for (var i = 0u; i < 8u; i++) {
         sum += ranks[first + i];
     }
-    parts[thread] = sum;
-    workgroupBarrier();
-    var before = 0u;
-    for (var other = thread & 0xe0u; other < thread; other++) {
-        before += parts[other];
-    }
+    let scan = scan_threads(seat, sum);
+    // The upper half digits come behind all of the lower ones.
+    var before = scan.before + (scan.total << 16u);
     for (var i = 0u; i < 8u; i++) {
         let own = ranks[first + i];
         ranks[first + i] = before;
         before += own;
-    }
-    workgroupBarrier();
-    // The last thread of a row has its total.
-    if (thread & 31u) == 31u {
-        parts[thread / 32u] = before;
-    }
-    workgroupBarrier();
-    if thread == 0u {
-        var start = 0u;
-        for (var half = 0u; half < 16u; half++) {
-            starts[half] = start;
-            start += (parts[half & 7u] >> (2u * (half & 8u))) & 0xffffu;
-        }
     }
     workgroupBarrier();
 }
@@ -109,13 +92,14 @@ fn count_item(thread: u32, half: u32) {
 fn take_place(thread: u32, half: u32) -> u32 {
     let at = (half & 7u) * THREADS + thread;
     let upper = 2u * (half & 8u);
-    let rank = (ranks[at] >> upper) & 0xffffu;
+    let place = (ranks[at] >> upper) & 0xffffu;
     ranks[at] += 1u << upper;
-    return starts[half] + rank;
+    return place;
 }
 
 // Sorts the items, four consecutive ones per thread, by the half digit that starts at bit `shift` of an item.
-fn sort_items(thread: u32, mine: vec4<u32>, shift: u32) {
+fn sort_items(seat: Seat, mine: vec4<u32>, shift: u32) {
+    let thread = seat.number;
     for (var row = 0u; row < 8u; row++) {
         ranks[row * THREADS + thread] = 0u;
     }
@@ -125,7 +109,7 @@ fn sort_items(thread: u32, mine: vec4<u32>, shift: u32) {
     count_item(thread, halves.z);
     count_item(thread, halves.w);
     workgroupBarrier();
-    scan_ranks(thread);
+    scan_ranks(seat);
     items[take_place(thread, halves.x)] = mine.x;
     items[take_place(thread, halves.y)] = mine.y;
     items[take_place(thread, halves.z)] = mine.z;
@@ -145,7 +129,7 @@ fn item(first: u32, place: u32, end: u32) -> u32 {
 fn scatter(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
+    @builtin(local_invocation_index) local_index: u32,
 ) {
     let block = group_number(group, groups);
     let end = length();
@@ -153,6 +137,8 @@ fn scatter(
     if block >= blocks {
         return;
     }
+    let seat = seat_of(local_index);
+    let thread = seat.number;
     let first = block * BLOCK;
     let own = 4u * thread;
     let unsorted = vec4(
@@ -161,10 +147,10 @@ fn scatter(
         item(first, own + 2u, end),
         item(first, own + 3u, end),
     );
-    sort_items(thread, unsorted, 16u);
+    sort_items(seat, unsorted, 16u);
     let half_sorted = vec4(items[own], items[own + 1u], items[own + 2u], items[own + 3u]);
     workgroupBarrier();
-    sort_items(thread, half_sorted, 20u);
+    sort_items(seat, half_sorted, 20u);
     for (var place = thread; place < BLOCK; place += THREADS) {
         let digit = items[place] >> 16u;
         if place == 0u || items[place - 1u] >> 16u != digit {

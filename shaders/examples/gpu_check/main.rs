@@ -3,6 +3,7 @@
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command line prints")]
 
 mod benchmark;
+mod doubts;
 mod parity;
 mod report;
 #[path = "../../../splat/benches/scene/mod.rs"]
@@ -37,6 +38,9 @@ struct Arguments {
     /// Checks only.
     #[arg(long)]
     no_benchmark: bool,
+    /// Only kernels that every device can run: what subgroups are worth shows beside a run without this.
+    #[arg(long)]
+    base_kernels: bool,
     /// Time this scene file (npz) instead of generated scenes; may be given several times.
     #[arg(long, value_name = "FILE.npz")]
     scene: Vec<PathBuf>,
@@ -58,10 +62,14 @@ fn main() -> ExitCode {
 
 /// Whether every check passed.
 fn run(arguments: &Arguments) -> Result<bool> {
-    let engine = GpuEngine::new(open(&arguments.device)?).context("the kernels")?;
-    let adapter = Adapter::new(engine.device().description());
+    let base = GpuEngine::new(open(&arguments.device)?.with_base_kernels()).context("the base kernels")?;
+    let engine = match arguments.base_kernels {
+        true => base.clone(),
+        false => GpuEngine::new(open(&arguments.device)?).context("the kernels")?,
+    };
+    let adapter = Adapter::new(engine.device());
     println!("{adapter}\n");
-    let checks = parity::run(&engine)?;
+    let checks = parity::run(&engine, engine.device().uses_subgroups().then_some(&base))?;
     let mut report =
         Report { version: env!("CARGO_PKG_VERSION"), adapter, checks, rows: Vec::new(), refinement: None };
     println!();

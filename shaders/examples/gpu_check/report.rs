@@ -3,7 +3,7 @@
 use std::fmt;
 
 use serde::Serialize;
-use splat_shaders::DeviceDescription;
+use splat_shaders::GpuDevice;
 
 use crate::benchmark::{Refinement, Row};
 
@@ -25,17 +25,21 @@ pub(crate) struct Adapter {
     backend: String,
     driver: String,
     features: Vec<&'static str>,
+    /// Of the kernels that have several forms.
+    kernels: &'static str,
     max_binding_bytes: u64,
 }
 
 impl Adapter {
-    pub(crate) fn new(of: &DeviceDescription) -> Self {
+    pub(crate) fn new(device: &GpuDevice) -> Self {
+        let of = device.description();
         Self {
             name: of.name.clone(),
             kind: format!("{:?}", of.kind).to_lowercase(),
             backend: of.backend.clone(),
             driver: of.driver.clone(),
             features: of.features.clone(),
+            kernels: if device.uses_subgroups() { "subgroups" } else { "base" },
             max_binding_bytes: of.max_binding,
         }
     }
@@ -43,8 +47,12 @@ impl Adapter {
 
 impl fmt::Display for Adapter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { name, kind, backend, driver, features, max_binding_bytes } = self;
-        write!(f, "{name} ({kind}, {backend}, {driver})\nfeatures: {}\n", features.join(", "))?;
+        let Self { name, kind, backend, driver, features, kernels, max_binding_bytes } = self;
+        write!(
+            f,
+            "{name} ({kind}, {backend}, {driver})\nfeatures: {}; kernels: {kernels}\n",
+            features.join(", ")
+        )?;
         write!(f, "largest binding: {} MiB", max_binding_bytes >> 20)
     }
 }

@@ -9,7 +9,7 @@ use naga::{
 use splat::raster;
 
 use crate::{
-    kernels::SOURCES,
+    kernels::{SOURCES, SUBGROUP_SOURCES},
     layout::{
         Density, Expectation, GEOMETRY, Moments, ReplaceSettings, SUMS, ScanSettings, SortSettings, State,
         Step, TILE, View,
@@ -18,7 +18,7 @@ use crate::{
 
 fn modules() -> Vec<(&'static str, Module)> {
     let parse = |source| naga::front::wgsl::parse_str(source).expect("the build has validated it");
-    SOURCES.iter().map(|&(name, source)| (name, parse(source))).collect()
+    SOURCES.iter().chain(SUBGROUP_SOURCES).map(|&(name, source)| (name, parse(source))).collect()
 }
 
 /// A name without what composing appended.
@@ -148,7 +148,8 @@ fn constants_are_those_of_the_cpu_engine() {
 #[test]
 fn kernels_keep_to_the_base_limits() {
     for (stage, module) in modules() {
-        let info = Validator::new(ValidationFlags::all(), Capabilities::empty())
+        // The build has validated the base forms without it.
+        let info = Validator::new(ValidationFlags::all(), Capabilities::SUBGROUP)
             .validate(&module)
             .expect("the build has validated it");
         for (number, entry) in module.entry_points.iter().enumerate() {

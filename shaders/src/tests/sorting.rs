@@ -7,6 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{run, support};
 use crate::{
     buffers::{BLOCK, CommonBuffers, DIGITS, SortBuffers, allocate, storage},
+    engine::Context,
     layout::State,
     program::Groups,
     readback::read,
@@ -18,8 +19,10 @@ const LENGTHS: [usize; 9] = [0, 1, 3, 255, 1023, 1024, 1025, 40_000, 270_001];
 
 #[test]
 fn exclusive_sums_are_those_of_a_loop() {
-    let Some(engine) = support::engine() else { return };
-    let context = &*engine.context;
+    support::engines().for_each(|engine| check_sums(&engine.context));
+}
+
+fn check_sums(context: &Context) {
     let binder = Binder { device: &context.device, kernels: &context.kernels };
     let mut random = ChaCha8Rng::seed_from_u64(1);
     for largest in [5, 1 << 20] {
@@ -49,8 +52,10 @@ fn exclusive_sums_are_those_of_a_loop() {
 
 #[test]
 fn keys_are_sorted_and_equal_ones_keep_their_order() {
-    let Some(engine) = support::engine() else { return };
-    let context = &*engine.context;
+    support::engines().for_each(|engine| check_order(&engine.context));
+}
+
+fn check_order(context: &Context) {
     let binder = Binder { device: &context.device, kernels: &context.kernels };
     let mut random = ChaCha8Rng::seed_from_u64(2);
     for (passes, largest) in [(4, u32::MAX), (4, 3), (2, 1 << 12), (1, 256), (3, 1 << 24)] {

@@ -2,11 +2,12 @@
 use splat_shaders::GpuEngine;
 use trackersplat_tests::golden::{Golden, check_moments, for_each_scene};
 
-use crate::support::engine;
+use crate::support::engines;
 
 fn for_each_golden(check: impl Fn(&str, &Golden, &GpuEngine)) {
-    let Some(engine) = engine() else { return };
-    for_each_scene(|name, golden| check(name, golden, engine));
+    for engine in engines() {
+        for_each_scene(|name, golden| check(name, golden, engine));
+    }
 }
 
 #[test]
@@ -31,7 +32,5 @@ fn blending_weights_of_a_footprint_match() {
 
 #[test]
 fn footprint_moments_match_on_every_track_field() {
-    if let Some(engine) = engine() {
-        check_moments(engine);
-    }
+    engines().for_each(|engine| check_moments(engine));
 }

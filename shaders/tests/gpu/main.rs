@@ -6,9 +6,15 @@
 )]
 
 mod algorithms;
+#[path = "../../examples/gpu_check/doubts.rs"]
+mod doubts;
 mod golden;
 mod moments;
 mod probe;
+#[path = "../../../splat/benches/scene/mod.rs"]
+mod scene;
 mod scenes;
 mod session;
 mod support;
+mod thresholds;
+mod variants;

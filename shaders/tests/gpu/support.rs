@@ -26,6 +26,26 @@ pub(crate) fn engine() -> Option<&'static GpuEngine> {
     engine.as_ref()
 }
 
+/// The same on the kernels that every device can run; `None` if the engine has none but those.
+pub(crate) fn base_engine() -> Option<&'static GpuEngine> {
+    static ENGINE: OnceLock<Option<GpuEngine>> = OnceLock::new();
+    let engine = ENGINE.get_or_init(|| {
+        if !engine()?.device().uses_subgroups() {
+            return None;
+        }
+        Some(GpuEngine::new(open().with_base_kernels()).expect("kernels compile on every device"))
+    });
+    if engine.is_none() {
+        eprintln!("skipped: no kernels beyond those that every device can run");
+    }
+    engine.as_ref()
+}
+
+/// Every form of the engine that the device can run.
+pub(crate) fn engines() -> impl Iterator<Item = &'static GpuEngine> {
+    engine().into_iter().chain(base_engine())
+}
+
 /// The device of this test program; the environment must not say that there is none.
 pub(crate) fn open() -> GpuDevice {
     let choice = choice().expect("callers have asked for the engine first");

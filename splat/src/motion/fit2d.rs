@@ -23,6 +23,8 @@ const LEAST_KEPT: f64 = 0.01;
 const MOST_EXCESS: f64 = 4.0;
 /// px²: what the sums may err by in the narrow direction of a footprint. One that is no wider has no affine map.
 const LEAST_EXTENT: f64 = 1e-5;
+/// Variance of an entry of the affine map that is not known: as good as infinite.
+const NO_MAP: f64 = 1e12;
 /// Effective pixels below which a footprint cannot show two surfaces.
 const LEAST_CONTESTED: f64 = 4.0;
 
@@ -75,8 +77,7 @@ pub(super) fn fit(
         claimed.max(contest.noise(residual_variance(first.affine_residual_power(), footprint.pixels)));
     let ridge = ridge(noise, independent_pixels, settings);
     let candidates = Candidates::new(&footprint, ridge);
-    let rounding = LEAST_EXTENT * trace(footprint.source);
-    let has_extent = footprint.source.determinant() >= settings.min_footprint_area.powi(2).max(rounding);
+    let has_extent = footprint.source.determinant() >= settings.min_footprint_area.powi(2);
     let order = match has_extent {
         true => candidates.select(noise, independent_pixels),
         false => Order::Translation,
@@ -103,11 +104,11 @@ pub(super) fn fit(
         && displacement.length_squared() <= still
         && candidates.is_rigid(resting, independent_pixels, settings);
 
-    let extent = match has_extent {
-        true => footprint.source,
-        false => DMat2::from_diagonal(DVec2::splat(LEAST_EXTENT)),
+    let has_map = footprint.source.determinant() > LEAST_EXTENT * trace(footprint.source);
+    let (strain, affine_covariance) = match has_map {
+        true => (footprint.strain * footprint.source.inverse(), footprint.source.inverse() * pixel_variance),
+        false => (DMat2::ZERO, DMat2::from_diagonal(DVec2::splat(NO_MAP))),
     };
-    let strain = if has_extent { footprint.strain * extent.inverse() } else { DMat2::ZERO };
     let fit = Fit {
         target: projected_mean + displacement,
         variance: variance + floor + wrong_surface,
@@ -116,7 +117,7 @@ pub(super) fn fit(
         order: if is_static { Order::Static } else { order },
         gradient: DMat2::IDENTITY + candidates.gradient(order),
         affine: DMat2::IDENTITY + strain,
-        affine_covariance: extent.inverse() * pixel_variance,
+        affine_covariance,
     };
     fit.is_finite().then_some(fit)
 }
@@ -178,6 +179,11 @@ fn residual_variance(power: f64, pixels: f64) -> f64 {
 }
 
 impl Fit {
+    /// Whether the footprint is wide enough to show a deformation.
+    pub(super) fn has_map(&self) -> bool {
+        self.affine_covariance.x_axis.x < NO_MAP
+    }
+
     fn is_finite(&self) -> bool {
         self.target.is_finite()
             && self.variance.is_finite()

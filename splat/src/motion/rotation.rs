@@ -186,6 +186,8 @@ struct System {
     torque: DVec3,
     prior: f64,
     chi_squared: f64,
+    /// Squared residuals of the axes over their number less the three unknowns of a rotation.
+    axes_misfit: f64,
     /// Number of residuals, counted with their robust weights, less the six unknowns.
     freedom: f64,
 }
@@ -216,10 +218,13 @@ impl System {
             system.coupling += coupling;
             system.force += information * residual;
         }
+        let members_chi_squared = system.chi_squared;
         for axis in axes {
             let turned = turn * axis.from;
             system.add_rotation(turned, axis.information, axis.to - turned, 1.0);
         }
+        system.axes_misfit =
+            (system.chi_squared - members_chi_squared) / (3.0 * axes.len() as f64 - 3.0).max(1.0);
         system
     }
 
@@ -267,10 +272,11 @@ impl System {
         (covariance * (self.force - self.coupling * turn), turn)
     }
 
-    /// Covariance of the rotation vector by what was claimed: strain of the neighbourhood makes a misfit, but no error of
-    /// the rotation.
+    /// Covariance of the rotation vector, times the misfit of the axes: strain of the neighbourhood is a misfit too, but no
+    /// error of the rotation.
     fn rotation_covariance(&self) -> DMat3 {
-        let covariance = (self.free_rotation() + DMat3::from_diagonal(DVec3::splat(self.prior))).inverse();
+        let information = self.free_rotation() * self.axes_misfit.max(1.0).recip();
+        let covariance = (information + DMat3::from_diagonal(DVec3::splat(self.prior))).inverse();
         if covariance.is_finite() {
             covariance
         } else {

@@ -17,6 +17,9 @@ const OFF_SURFACE: f64 = 0.3;
 /// The same for an infinitely thin Gaussian: perspective and curvature within the footprint.
 const LEAST_ERROR: f64 = 0.01;
 
+/// Two views see a tilted disc and its mirror image alike: what is no stretch of the one may be one of the other.
+const LEAST_VIEWS: usize = 3;
+
 /// Changes of the logarithms of all Gaussians' scales; zero unless significant.
 ///
 /// An axis `q` whose line turns to `R q` is seen as `A T q ≈ λ T' R q`, with the Jacobian `T` at the old and `T'` at the
@@ -84,6 +87,9 @@ impl Line {
     /// the rotation would look like a stretch.
     fn log_stretch(&self, seen: &[&Observation], views: &[MotionView]) -> Option<(f64, f64)> {
         let sights: Vec<Sight> = seen.iter().filter_map(|o| self.sight(o, &views[o.view].camera)).collect();
+        if sights.len() < LEAST_VIEWS {
+            return None;
+        }
         let (mut information, mut right, mut by_turn) = (0.0, 0.0, DVec3::ZERO);
         for Sight { expected, found, variance, by_turn: change } in &sights {
             information += expected.length_squared() / variance;
@@ -110,7 +116,12 @@ impl Line {
         let expected = in_view([u, v], self.turned);
         let variance = before.dot(fit.affine_covariance * before);
         let by_turn = self.turned.cross(u * expected.x + v * expected.y);
-        (variance > 0.0).then(|| Sight { expected, found: fit.affine * before, variance, by_turn })
+        (variance > 0.0 && fit.has_map()).then(|| Sight {
+            expected,
+            found: fit.affine * before,
+            variance,
+            by_turn,
+        })
     }
 }
 
