@@ -150,6 +150,10 @@ fn adapters() -> Vec<Adapter> {
     pollster::block_on(Instance::new(descriptor).enumerate_adapters(Backends::all()))
 }
 
+/// Size from which subgroups are taken without being asked for: smaller ones leave more to add up afterwards than the sixteen
+/// threads of the form without (`wgsl/shared/group_scan.wgsl`).
+const WORTHWHILE_SUBGROUP: u32 = 16;
+
 /// What went wrong on a device outside of the calls that return errors.
 #[derive(Debug, Default)]
 struct Fault {
@@ -165,7 +169,7 @@ pub struct GpuDevice {
     description: DeviceDescription,
     limits: Limits,
     memory_limit: Option<u64>,
-    has_base_kernels: bool,
+    uses_subgroups: bool,
     fault: Arc<Mutex<Fault>>,
 }
 
@@ -202,6 +206,8 @@ impl GpuDevice {
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| {
             DeviceError::Refused { name: description.name.clone(), reason: error.to_string() }
         })?;
+        let uses_subgroups = device.features().contains(Features::SUBGROUP)
+            && adapter.get_info().subgroup_min_size >= WORTHWHILE_SUBGROUP;
         let fault = Arc::new(Mutex::new(Fault::default()));
         let lost = Arc::clone(&fault);
         device.set_device_lost_callback(move |_, message| {
@@ -213,7 +219,7 @@ impl GpuDevice {
             let mut fault = failed.lock().unwrap_or_else(PoisonError::into_inner);
             fault.error.get_or_insert(error.to_string());
         }));
-        Ok(Self { device, queue, description, limits, memory_limit: None, has_base_kernels: false, fault })
+        Ok(Self { device, queue, description, limits, memory_limit: None, uses_subgroups, fault })
     }
 
     /// Lets jobs take so many bytes at most; without it, jobs take what the driver grants, which it does not tell before.
@@ -221,15 +227,16 @@ impl GpuDevice {
         Self { memory_limit: Some(bytes), ..self }
     }
 
-    /// Keeps to the kernels that every device can run. The results are the same to the byte; this is for comparing times,
-    /// and for a driver whose subgroups are broken.
-    pub fn with_base_kernels(self) -> Self {
-        Self { has_base_kernels: true, ..self }
+    /// Says whether stages run in their form for subgroups, where the device has any. The results are the same to the byte;
+    /// this is for comparing times, and for a driver whose subgroups are broken. Without it, [`GpuDevice::open`] decides.
+    pub fn with_subgroups(self, wanted: bool) -> Self {
+        let uses_subgroups = wanted && self.device.features().contains(Features::SUBGROUP);
+        Self { uses_subgroups, ..self }
     }
 
     /// Whether stages run in their form for subgroups.
     pub fn uses_subgroups(&self) -> bool {
-        self.device.features().contains(Features::SUBGROUP) && !self.has_base_kernels
+        self.uses_subgroups
     }
 
     /// See [`GpuDevice::with_memory_limit`].
@@ -244,8 +251,8 @@ impl GpuDevice {
 
     /// Largest buffer that a kernel can see, bytes.
     pub(crate) fn max_buffer(&self) -> u64 {
-        // Kernels count words in 32 bits.
-        let counted = 4 * u64::from(u32::MAX);
+        // Kernels count words in 32 bits, and the last row of workgroups reaches some beyond the end: 65 535 blocks of 1024.
+        let counted = 4 * u64::from(u32::MAX - (1 << 27));
         self.limits.max_buffer_size.min(self.limits.max_storage_buffer_binding_size).min(counted)
     }
 

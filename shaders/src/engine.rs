@@ -73,7 +73,7 @@ impl GpuEngine {
     }
 
     /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
-    /// `H × W × 3`, `alpha_gradient` `H × W` or empty.
+    /// `H × W × 3`, `alpha_gradient` `H × W` or empty; other lengths are invalid input.
     pub fn render_backward(
         &self,
         gaussians: &Gaussians,
@@ -83,6 +83,7 @@ impl GpuEngine {
         alpha_gradient: &[f32],
     ) -> Result<GaussianGradients, EngineError> {
         check_size(camera)?;
+        check_seeds(camera, image_gradient, alpha_gradient)?;
         let Context { device, kernels } = &*self.context;
         let view = ViewBuffer::new(device, View::new(camera, background))?;
         let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
@@ -114,6 +115,11 @@ impl GpuEngine {
         has_gradient: bool,
     ) -> Result<Buffers, EngineError> {
         let device = &self.context.device;
+        // Before the sizes of buffers are no numbers any more.
+        if view.pixels() > u64::from(u32::MAX) {
+            let needed = view.pixels().saturating_mul(16);
+            return Err(EngineError::OutOfResources { needed, available: device.max_buffer() });
+        }
         let (count, tiles) = (gaussians.len() as u64, view.tile_count().into());
         let size = Size {
             count,
@@ -169,6 +175,18 @@ impl GpuEngine {
             buffers.resize(device, size)?;
         }
     }
+}
+
+fn check_seeds(camera: &Camera, image: &[f32], alpha: &[f32]) -> Result<(), EngineError> {
+    let pixels = camera.width as usize * camera.height as usize;
+    if image.len() == 3 * pixels && (alpha.is_empty() || alpha.len() == pixels) {
+        return Ok(());
+    }
+    Err(EngineError::InvalidInput(format!(
+        "gradients by {} values and {} alphas for {pixels} pixels; give three values per pixel, and one alpha or none",
+        image.len(),
+        alpha.len()
+    )))
 }
 
 impl Engine for GpuEngine {

@@ -231,3 +231,28 @@ fn a_camera_without_pixels_is_refused() {
         assert!(matches!(refused, Err(EngineError::InvalidInput(_))), "{width}x{height}");
     }
 }
+
+#[test]
+fn a_camera_beyond_all_memory_is_refused_with_figures() {
+    let Some(gpu) = engine() else { return };
+    // In the last two, bytes or tiles exceed what counts them.
+    for (width, height) in [(1 << 20, 1 << 20), (1 << 30, 1 << 30), (u32::MAX, u32::MAX)] {
+        let camera = Camera { width, height, ..arc(1, 17, 17).swap_remove(0) };
+        let refused = gpu.render(&blobs(3, 1, 1), &camera, BACKGROUND);
+        assert!(matches!(refused, Err(EngineError::OutOfResources { .. })), "{width}x{height}");
+    }
+    // The device is as it was.
+    assert_drawn_alike("after a refusal", &blobs(30, 1, 1), &arc(1, 17, 17)[0]);
+}
+
+#[test]
+fn gradients_by_another_number_of_pixels_are_refused() {
+    let Some(gpu) = engine() else { return };
+    let (gaussians, camera) = (blobs(3, 1, 1), &arc(1, 17, 13)[0]);
+    let pixels = 17 * 13;
+    for (image, alpha) in [(3 * pixels - 1, 0), (3 * pixels + 3, 0), (0, 0), (3 * pixels, 1)] {
+        let refused =
+            gpu.render_backward(&gaussians, camera, BACKGROUND, &vec![1.0; image], &vec![1.0; alpha]);
+        assert!(matches!(refused, Err(EngineError::InvalidInput(_))), "{image} values, {alpha} alphas");
+    }
+}
