@@ -42,7 +42,8 @@ pub struct DeviceDescription {
     pub driver: String,
     /// Largest buffer that a kernel can see, bytes.
     pub max_binding: u64,
-    /// Optional capabilities: `subgroup` and `timestamps` are used where they are; `f16` and `int64` are told only.
+    /// Optional capabilities: `subgroup` and `timestamps` have a use, see [`GpuDevice::with_subgroups`]; `f16` and `int64` are
+    /// told only.
     pub features: Vec<&'static str>,
 }
 
