@@ -30,7 +30,8 @@ pub(crate) fn separated(geometry: &[[f32; GEOMETRY]], sh: Vec<f32>, sh_degree: u
     }
 }
 
-fn check_lengths(gaussians: &Gaussians) -> Result<(), EngineError> {
+/// Whether the arrays belong together.
+pub(crate) fn check_lengths(gaussians: &Gaussians) -> Result<(), EngineError> {
     let count = gaussians.len();
     let lengths = [
         ("rotations", gaussians.rotations.len(), count),
