@@ -47,7 +47,8 @@ pub struct DeviceDescription {
     pub memory: Option<u64>,
     /// Largest buffer that a kernel can see, bytes.
     pub max_binding: u64,
-    /// Optional capabilities: `subgroup` and `timestamps` are used where they are; `f16` and `int64` are told only.
+    /// Optional capabilities: `subgroup` and `timestamps` have a use, see [`GpuDevice::with_subgroups`]; `f16` and `int64` are
+    /// told only.
     pub features: Vec<&'static str>,
 }
 
@@ -200,6 +201,10 @@ fn adapters() -> Vec<Adapter> {
     pollster::block_on(Instance::new(descriptor).enumerate_adapters(Backends::all()))
 }
 
+/// Size from which subgroups are taken without being asked for: smaller ones leave more to add up afterwards than the sixteen
+/// threads of the form without (`wgsl/shared/group_scan.wgsl`).
+const WORTHWHILE_SUBGROUP: u32 = 16;
+
 /// What went wrong on a device outside of the calls that return errors.
 #[derive(Debug, Default)]
 struct Fault {
@@ -216,7 +221,7 @@ pub struct GpuDevice {
     label: String,
     limits: Limits,
     memory_limit: Option<u64>,
-    has_base_kernels: bool,
+    uses_subgroups: bool,
     fault: Arc<Mutex<Fault>>,
 }
 
@@ -251,6 +256,8 @@ impl GpuDevice {
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| {
             DeviceError::Refused { name: description.name.clone(), reason: error.to_string() }
         })?;
+        let uses_subgroups = device.features().contains(Features::SUBGROUP)
+            && adapter.get_info().subgroup_min_size >= WORTHWHILE_SUBGROUP;
         let fault = Arc::new(Mutex::new(Fault::default()));
         let lost = Arc::clone(&fault);
         device.set_device_lost_callback(move |_, message| {
@@ -263,7 +270,7 @@ impl GpuDevice {
             fault.error.get_or_insert(error.to_string());
         }));
         let (label, memory_limit) = (description.label(), description.memory);
-        Ok(Self { device, queue, description, label, limits, memory_limit, has_base_kernels: false, fault })
+        Ok(Self { device, queue, description, label, limits, memory_limit, uses_subgroups, fault })
     }
 
     /// Lets jobs take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where that is not
@@ -272,15 +279,16 @@ impl GpuDevice {
         Self { memory_limit: Some(bytes), ..self }
     }
 
-    /// Keeps to the kernels that every device can run. The results are the same to the byte; this is for comparing times,
-    /// and for a driver whose subgroups are broken.
-    pub fn with_base_kernels(self) -> Self {
-        Self { has_base_kernels: true, ..self }
+    /// Says whether stages run in their form for subgroups, where the device has any. The results are the same to the byte;
+    /// this is for comparing times, and for a driver whose subgroups are broken. Without it, [`GpuDevice::open`] decides.
+    pub fn with_subgroups(self, wanted: bool) -> Self {
+        let uses_subgroups = wanted && self.device.features().contains(Features::SUBGROUP);
+        Self { uses_subgroups, ..self }
     }
 
     /// Whether stages run in their form for subgroups.
     pub fn uses_subgroups(&self) -> bool {
-        self.device.features().contains(Features::SUBGROUP) && !self.has_base_kernels
+        self.uses_subgroups
     }
 
     /// See [`GpuDevice::with_memory_limit`].
@@ -300,8 +308,8 @@ impl GpuDevice {
 
     /// Largest buffer that a kernel can see, bytes.
     pub(crate) fn max_buffer(&self) -> u64 {
-        // Kernels count words in 32 bits.
-        let counted = 4 * u64::from(u32::MAX);
+        // Kernels count words in 32 bits, and the last row of workgroups reaches some beyond the end: 65 535 blocks of 1024.
+        let counted = 4 * u64::from(u32::MAX - (1 << 27));
         self.limits.max_buffer_size.min(self.limits.max_storage_buffer_binding_size).min(counted)
     }
 

@@ -13,11 +13,13 @@ use splat::{
 };
 
 use crate::{
-    buffers::{Buffers, GradientBuffers, Size, admit, allocate, first_capacity, separated, storage},
+    buffers::{
+        Buffers, GradientBuffers, ParameterBuffers, Size, admit, allocate, first_capacity, separated, storage,
+    },
     device::GpuDevice,
     kernels::Kernels,
     layout::{GEOMETRY, State, Step, View},
-    moments::footprint_moments,
+    moments::{LastMeasured, footprint_moments},
     program::{Dispatch, record},
     readback::read,
     session::GpuSession,
@@ -29,6 +31,7 @@ use crate::{
 pub(crate) struct Context {
     pub device: GpuDevice,
     pub kernels: Kernels,
+    pub measured: LastMeasured,
 }
 
 /// The GPU engine.
@@ -42,7 +45,8 @@ impl GpuEngine {
     pub fn new(device: GpuDevice) -> Result<Self, EngineError> {
         let kernels = Kernels::new(&device.device, device.uses_subgroups());
         device.check()?;
-        Ok(Self { context: Arc::new(Context { device, kernels }) })
+        let context = Context { device, kernels, measured: LastMeasured::default() };
+        Ok(Self { context: Arc::new(context) })
     }
 
     /// The device.
@@ -58,7 +62,7 @@ impl GpuEngine {
         background: [f32; 3],
     ) -> Result<Vec<u8>, EngineError> {
         check_size(camera)?;
-        let Context { device, kernels } = &*self.context;
+        let Context { device, kernels, .. } = &*self.context;
         let view = ViewBuffer::new(device, View::new(camera, background))?;
         let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, false)?)?;
         let pixels = view.data.pixels();
@@ -73,7 +77,7 @@ impl GpuEngine {
     }
 
     /// Gradient of `Σ image · image_gradient + Σ alpha · alpha_gradient` by every parameter; `image_gradient` is
-    /// `H × W × 3`, `alpha_gradient` `H × W` or empty.
+    /// `H × W × 3`, `alpha_gradient` `H × W` or empty; other lengths are invalid input.
     pub fn render_backward(
         &self,
         gaussians: &Gaussians,
@@ -83,7 +87,8 @@ impl GpuEngine {
         alpha_gradient: &[f32],
     ) -> Result<GaussianGradients, EngineError> {
         check_size(camera)?;
-        let Context { device, kernels } = &*self.context;
+        check_seeds(camera, image_gradient, alpha_gradient)?;
+        let Context { device, kernels, .. } = &*self.context;
         let view = ViewBuffer::new(device, View::new(camera, background))?;
         let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
         let gradients = GradientBuffers::new(device, &buffers.size)?;
@@ -114,17 +119,35 @@ impl GpuEngine {
         has_gradient: bool,
     ) -> Result<Buffers, EngineError> {
         let device = &self.context.device;
-        let (count, tiles) = (gaussians.len() as u64, view.tile_count().into());
+        let size = self.size(gaussians.len(), gaussians.sh_coefficients(), view, has_gradient)?;
+        Buffers::new(device, ParameterBuffers::new(device, gaussians)?, &size)
+    }
+
+    /// What [`GpuEngine::buffers`] takes, if the device would grant it.
+    pub(crate) fn size(
+        &self,
+        count: usize,
+        coefficients: usize,
+        view: &View,
+        has_gradient: bool,
+    ) -> Result<Size, EngineError> {
+        let device = &self.context.device;
+        // Before the sizes of buffers are no numbers any more.
+        if view.pixels() > u64::from(u32::MAX) {
+            let needed = view.pixels().saturating_mul(16);
+            return Err(EngineError::OutOfResources { needed, available: device.max_buffer() });
+        }
+        let (count, tiles) = (count as u64, view.tile_count().into());
         let size = Size {
             count,
-            coefficients: gaussians.sh_coefficients() as u64,
+            coefficients: coefficients as u64,
             pixels: view.pixels(),
             tiles,
             capacity: first_capacity(count, tiles),
             has_gradient,
         };
         admit(device, &Buffers::requests(&size))?;
-        Buffers::new(device, gaussians, &size)
+        Ok(size)
     }
 
     /// Stages 1 to 3, with more room until there is enough.
@@ -145,7 +168,7 @@ impl GpuEngine {
         mut buffers: Buffers,
         stages: fn(&Binder<'_>, &Buffers, &ViewBuffer) -> Vec<Dispatch>,
     ) -> Result<Buffers, EngineError> {
-        let Context { device, kernels } = &*self.context;
+        let Context { device, kernels, .. } = &*self.context;
         loop {
             let step = Step {
                 count: gaussians.len() as u32,
@@ -169,6 +192,18 @@ impl GpuEngine {
             buffers.resize(device, size)?;
         }
     }
+}
+
+fn check_seeds(camera: &Camera, image: &[f32], alpha: &[f32]) -> Result<(), EngineError> {
+    let pixels = camera.width as usize * camera.height as usize;
+    if image.len() == 3 * pixels && (alpha.is_empty() || alpha.len() == pixels) {
+        return Ok(());
+    }
+    Err(EngineError::InvalidInput(format!(
+        "gradients by {} values and {} alphas for {pixels} pixels; give three values per pixel, and one alpha or none",
+        image.len(),
+        alpha.len()
+    )))
 }
 
 impl Engine for GpuEngine {

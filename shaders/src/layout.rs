@@ -151,9 +151,9 @@ impl View {
         }
     }
 
-    /// Number of tiles.
+    /// Number of tiles; saturated, for a camera of more pixels than any device has room for.
     pub(crate) fn tile_count(&self) -> u32 {
-        self.tiles[0] * self.tiles[1]
+        self.tiles[0].saturating_mul(self.tiles[1])
     }
 
     /// Number of pixels.

@@ -83,7 +83,7 @@ impl Probe {
         let mut session = GpuSession::new(Arc::clone(&context), input)?;
         session.step(0, &rates)?;
         session.take_losses()?;
-        let Context { device, kernels } = &*context;
+        let Context { device, kernels, .. } = &*context;
         let binder = Binder { device, kernels };
         let (buffers, view) = session.first_view();
         let of_tracks = MomentBuffers::new(device, &buffers.size, tracks)?;

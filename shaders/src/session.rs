@@ -93,7 +93,7 @@ impl GpuSession {
         let views = input.views.iter().map(|view| session_view(device, view, background, weight));
         let mut session = Self {
             views: views.collect::<Result<_, _>>()?,
-            buffers: Buffers::new(device, gaussians, &size)?,
+            buffers: Buffers::new(device, ParameterBuffers::new(device, gaussians)?, &size)?,
             gradients: GradientBuffers::new(device, &size)?,
             optimiser: OptimiserBuffers::new(device, &size, &active)?,
             loss: LossBuffers::new(device, &size, REMEMBERED)?,
@@ -139,7 +139,7 @@ impl GpuSession {
 
     /// Binds every view's program to the buffers as they are now, and clears the device's state.
     fn bind(&mut self) {
-        let Context { device, kernels } = &*self.context;
+        let Context { device, kernels, .. } = &*self.context;
         let binder = Binder { device, kernels };
         let programs: Vec<_> =
             (0..self.views.len()).map(|view| self.stages(&binder, view).concat()).collect();
@@ -209,7 +209,7 @@ impl GpuSession {
         active: &[bool],
         size: &Size,
     ) -> Result<OptimiserBuffers, EngineError> {
-        let Context { device, kernels } = &*self.context;
+        let Context { device, kernels, .. } = &*self.context;
         let count = size.count;
         let taken = OptimiserBuffers::new(device, size, active)?;
         let [sources] = allocate(device, [storage("sources", 4 * count)])?;

@@ -123,7 +123,7 @@ fn lower_bound(tile: u32) -> u32 {
     var low = 0u;
     var high = state.intersections;
     while low < high {
-        let middle = (low + high) / 2u;
+        let middle = low + (high - low) / 2u;
         if sorted_keys[middle] < tile {
             low = middle + 1u;
         } else {

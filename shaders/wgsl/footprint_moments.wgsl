@@ -283,10 +283,22 @@ fn footprint_moments(
 // In the order of `wanted`.
 @group(0) @binding(12) var<storage, read_write> moments: array<Moments>;
 
+// More tiles than this are joined by a whole workgroup.
+const MANY: u32 = 64u;
+
+// Gaussians of the workgroup that have many, in any order, and their number.
+var<workgroup> large: array<u32, THREADS>;
+var<workgroup> large_count: atomic<u32>;
+// What each of the first threads has joined.
+var<workgroup> joints: array<Moments, LANES>;
+
 // From raw sums to means and central sums.
 fn centred(sums: Moments) -> Moments {
     var m = sums;
     let w = sums.weights.x;
+    if !(w > 0.0) {
+        return m;
+    }
     m.first = sums.first / w;
     let mean = m.first;
     m.second -= w * vec4(mean.x * mean.x, mean.x * mean.y, mean.y * mean.y, mean.z * mean.z + mean.w * mean.w);
@@ -299,21 +311,15 @@ fn pixel_of(anchor: u32) -> vec2<f32> {
     return vec2(f32(anchor % view.size.x), f32(anchor / view.size.x));
 }
 
-// The moments of both; `all` has some weight or is zero.
-fn joined(all: Moments, tile: Moments) -> Moments {
+// The central moments of both.
+fn joined(all: Moments, other: Moments) -> Moments {
     var m = all;
-    m.weights += tile.weights;
-    m.pixels += tile.pixels;
-    if !(tile.weights.x > 0.0) {
-        return m;
-    }
-    let other = centred(tile);
     if !(all.weights.x > 0.0) {
-        m.first = other.first;
-        m.second = other.second;
-        m.cross = other.cross;
-        m.reference = other.reference;
-        m.anchor = other.anchor;
+        m = other;
+    }
+    m.weights = all.weights + other.weights;
+    m.pixels = all.pixels + other.pixels;
+    if !(all.weights.x > 0.0 && other.weights.x > 0.0) {
         return m;
     }
     let base = vec4(pixel_of(other.anchor) - pixel_of(all.anchor), other.reference - all.reference);
@@ -326,20 +332,63 @@ fn joined(all: Moments, tile: Moments) -> Moments {
     return m;
 }
 
+// Every `stride`-th tile from slot `first` on.
+fn joined_tiles(first: u32, end: u32, stride: u32) -> Moments {
+    var all: Moments;
+    for (var slot = first; slot < end; slot += stride) {
+        all = joined(all, centred(tile_sums[slot]));
+    }
+    return all;
+}
+
+// The same by the whole workgroup, in an order that depends on the number of tiles only.
+fn joined_together(range: vec2<u32>, thread: u32) -> Moments {
+    if thread < LANES {
+        joints[thread] = joined_tiles(range.x + thread, range.x + range.y, LANES);
+    }
+    workgroupBarrier();
+    for (var stride = LANES / 2u; stride > 0u; stride /= 2u) {
+        if thread < stride {
+            joints[thread] = joined(joints[thread], joints[thread + stride]);
+        }
+        workgroupBarrier();
+    }
+    let all = joints[0];
+    workgroupBarrier();
+    return all;
+}
+
 @compute @workgroup_size(THREADS)
 fn join_moments(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let place = group_number(group, groups) * THREADS + thread;
-    if place >= wanted[0] {
-        return;
+    let first_place = group_number(group, groups) * THREADS;
+    let place = first_place + thread;
+    var range = vec2(0u);
+    if place < wanted[0] {
+        range = ranges[wanted[place + 1u]];
     }
-    let range = ranges[wanted[place + 1u]];
+    if thread == 0u {
+        atomicStore(&large_count, 0u);
+    }
+    workgroupBarrier();
     var all: Moments;
-    for (var k = 0u; k < range.y; k++) {
-        all = joined(all, tile_sums[range.x + k]);
+    if range.y > MANY {
+        large[atomicAdd(&large_count, 1u)] = thread;
+    } else {
+        all = joined_tiles(range.x, range.x + range.y, 1u);
     }
-    moments[place] = all;
+    let together = workgroupUniformLoad(&large_count);
+    for (var i = 0u; i < together; i++) {
+        let owner = large[i];
+        let found = joined_together(ranges[wanted[first_place + owner + 1u]], thread);
+        if thread == owner {
+            all = found;
+        }
+    }
+    if place < wanted[0] {
+        moments[place] = all;
+    }
 }

@@ -38,9 +38,9 @@ struct Arguments {
     /// Checks only.
     #[arg(long)]
     no_benchmark: bool,
-    /// Only kernels that every device can run: what subgroups are worth shows beside a run without this.
-    #[arg(long)]
-    base_kernels: bool,
+    /// Run stages in their form for subgroups, or not; without it, by what the device has.
+    #[arg(long, value_name = "true|false")]
+    subgroups: Option<bool>,
     /// Time this scene file (npz) instead of generated scenes; may be given several times.
     #[arg(long, value_name = "FILE.npz")]
     scene: Vec<PathBuf>,
@@ -62,14 +62,17 @@ fn main() -> ExitCode {
 
 /// Whether every check passed.
 fn run(arguments: &Arguments) -> Result<bool> {
-    let base = GpuEngine::new(open(&arguments.device)?.with_base_kernels()).context("the base kernels")?;
-    let engine = match arguments.base_kernels {
-        true => base.clone(),
-        false => GpuEngine::new(open(&arguments.device)?).context("the kernels")?,
-    };
+    let device = open(&arguments.device)?;
+    let by_device = device.uses_subgroups();
+    let device = device.with_subgroups(arguments.subgroups.unwrap_or(by_device));
+    let other = open(&arguments.device)?.with_subgroups(!device.uses_subgroups());
+    let has_other = other.uses_subgroups() != device.uses_subgroups();
+    let engine = GpuEngine::new(device).context("the kernels")?;
+    let other =
+        has_other.then(|| GpuEngine::new(other)).transpose().context("the other form of the kernels")?;
     let adapter = Adapter::new(engine.device());
     println!("{adapter}\n");
-    let checks = parity::run(&engine, engine.device().uses_subgroups().then_some(&base))?;
+    let checks = parity::run(&engine, other.as_ref())?;
     let mut report =
         Report { version: env!("CARGO_PKG_VERSION"), adapter, checks, rows: Vec::new(), refinement: None };
     println!();

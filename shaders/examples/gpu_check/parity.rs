@@ -40,8 +40,8 @@ const REWEIGHTING: Reweighting = Reweighting { passes: 3, noise_correlation_area
 
 const STEPS: usize = 20;
 
-/// Every check, printed as it is made; `base` runs the kernels that every device can run, where `engine` has others.
-pub(crate) fn run(engine: &GpuEngine, base: Option<&GpuEngine>) -> Result<Vec<Check>> {
+/// Every check, printed as it is made; `other` runs the other form of the kernels, with or without subgroups.
+pub(crate) fn run(engine: &GpuEngine, other: Option<&GpuEngine>) -> Result<Vec<Check>> {
     let mut checks = Vec::new();
     let mut add = |check: Check| {
         println!("{check}");
@@ -58,7 +58,7 @@ pub(crate) fn run(engine: &GpuEngine, base: Option<&GpuEngine>) -> Result<Vec<Ch
             moments(engine, &scene, &doubts, &name, reweighting)?.into_iter().for_each(&mut add);
         }
     }
-    session(engine, base)?.into_iter().for_each(&mut add);
+    session(engine, other)?.into_iter().for_each(&mut add);
     Ok(checks)
 }
 
@@ -189,8 +189,8 @@ fn difference(found: &FootprintMoments, exact: &FootprintMoments) -> [f64; 2] {
     ]
 }
 
-/// The same optimisation on both engines, on the device twice, and once more on the base kernels.
-fn session(engine: &GpuEngine, base: Option<&GpuEngine>) -> Result<Vec<Check>> {
+/// The same optimisation on both engines, on the device twice, and once more on the other form of its kernels.
+fn session(engine: &GpuEngine, other: Option<&GpuEngine>) -> Result<Vec<Check>> {
     let scene = scene::generate(SceneSize { gaussians: 3_000, width: 160, height: 90, sh_degree: 3 });
     let (ours, our_losses) = optimised(engine, &scene)?;
     let (_, losses) = optimised(&CpuEngine::default(), &scene)?;
@@ -200,7 +200,8 @@ fn session(engine: &GpuEngine, base: Option<&GpuEngine>) -> Result<Vec<Check>> {
         // Adam's first steps are of the sign of the gradient alone, whatever its size.
         Check::new("session", "loss after 20 steps, relative", apart(STEPS - 1), 1e-2),
     ];
-    let others = [(Some(engine), "second run has other bytes"), (base, "base kernels give other bytes")];
+    let others =
+        [(Some(engine), "second run has other bytes"), (other, "other form of the kernels has other bytes")];
     for (engine, what) in others {
         let Some(engine) = engine else { continue };
         let (again, _) = optimised(engine, &scene)?;

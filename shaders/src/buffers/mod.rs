@@ -40,9 +40,9 @@ pub(crate) struct Size {
 /// A buffer that is wanted.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Request {
-    label: &'static str,
-    bytes: u64,
-    usage: BufferUsages,
+    pub label: &'static str,
+    pub bytes: u64,
+    pub usage: BufferUsages,
 }
 
 /// A buffer that kernels read and write.

@@ -30,6 +30,23 @@ pub(crate) fn separated(geometry: &[[f32; GEOMETRY]], sh: Vec<f32>, sh_degree: u
     }
 }
 
+/// Whether the arrays belong together.
+pub(crate) fn check_lengths(gaussians: &Gaussians) -> Result<(), EngineError> {
+    let count = gaussians.len();
+    let lengths = [
+        ("rotations", gaussians.rotations.len(), count),
+        ("log_scales", gaussians.log_scales.len(), count),
+        ("logit_opacities", gaussians.logit_opacities.len(), count),
+        ("sh", gaussians.sh.len(), 3 * gaussians.sh_coefficients() * count),
+    ];
+    match lengths.into_iter().find(|(_, found, wanted)| found != wanted) {
+        None => Ok(()),
+        Some((property, found, wanted)) => Err(EngineError::InvalidInput(format!(
+            "`{property}` has {found} values, {wanted} are needed for {count} Gaussians; export the set again"
+        ))),
+    }
+}
+
 /// The parameters of a set.
 #[derive(Clone, Debug)]
 pub(crate) struct ParameterBuffers {
@@ -42,8 +59,9 @@ impl ParameterBuffers {
         [storage("geometry", 4 * GEOMETRY as u64 * count), storage("sh", 12 * coefficients * count)]
     }
 
-    /// Uploads a set.
+    /// Uploads a set, whose parameters need not be finite but there.
     pub(crate) fn new(device: &GpuDevice, gaussians: &Gaussians) -> Result<Self, EngineError> {
+        check_lengths(gaussians)?;
         let requests = Self::requests(gaussians.len() as u64, gaussians.sh_coefficients() as u64);
         let [geometry, sh] = allocate(device, requests)?;
         device.queue.write_buffer(&geometry, 0, bytemuck::cast_slice(&interleaved(gaussians)));

@@ -1,6 +1,6 @@
 //! What a view is drawn and differentiated with.
 
-use splat::{engine::EngineError, gaussians::Gaussians};
+use splat::engine::EngineError;
 use wgpu::Buffer;
 
 use super::{BLOCK, CommonBuffers, ParameterBuffers, Request, Size, allocate, storage};
@@ -136,12 +136,16 @@ impl Buffers {
         groups.concat()
     }
 
-    /// Uploads a set and allocates what a view of it takes; `size` fits the set.
-    pub(crate) fn new(device: &GpuDevice, gaussians: &Gaussians, size: &Size) -> Result<Self, EngineError> {
+    /// Allocates what a view of a set takes beside its parameters; `size` fits the set.
+    pub(crate) fn new(
+        device: &GpuDevice,
+        parameters: ParameterBuffers,
+        size: &Size,
+    ) -> Result<Self, EngineError> {
         Ok(Self {
             size: *size,
             common: CommonBuffers::new(device)?,
-            parameters: ParameterBuffers::new(device, gaussians)?,
+            parameters,
             footprints: FootprintBuffers::new(device, size.count)?,
             intersections: IntersectionBuffers::new(device, size.capacity, size.has_gradient)?,
             images: ImageBuffers::new(device, size.pixels, size.tiles)?,

@@ -1,6 +1,8 @@
 //! Moments against sums in double precision over the very footprints and lists that the device made: what remains are the
 //! errors of the sums and of alpha.
 
+use std::sync::Arc;
+
 use glam::DVec2;
 use splat::{
     cameras::Camera,
@@ -15,6 +17,7 @@ use super::support::{self, arc, blobs, rough_tracks};
 use crate::{
     GpuEngine,
     layout::{TILE, View},
+    moments::LastMeasured,
     readback::read,
     stages::{ViewBuffer, sorted_slots},
 };
@@ -163,4 +166,39 @@ fn errors(found: &FootprintMoments, exact: &FootprintMoments) -> [f64; 3] {
             + ratio(found.blend_weight, exact.blend_weight)
             + ratio(found.visible, exact.visible),
     ]
+}
+
+#[test]
+fn a_set_is_uploaded_once_and_again_when_any_bit_of_it_changes() {
+    let Some(engine) = support::engine() else { return };
+    let device = &engine.context.device;
+    let last = LastMeasured::default();
+    let gaussians = blobs(50, 2, 53);
+    let first = last.take_over(device, &gaussians).unwrap();
+    assert!(Arc::ptr_eq(&first, &last.take_over(device, &gaussians.clone()).unwrap()));
+    let changes: [fn(&mut Gaussians); 8] = [
+        |g| g.means[49][2] = f32::from_bits(g.means[49][2].to_bits() + 1),
+        |g| g.rotations[0][3] *= 1.5,
+        |g| g.log_scales[7][1] = -0.0,
+        |g| g.log_scales[7][1] = 0.0,
+        |g| g.logit_opacities[20] = f32::NAN,
+        |g| g.sh[27 * 30 + 2] = f32::NAN,
+        |g| *g = g.select(&(0..49).collect::<Vec<_>>()),
+        |g| *g = Gaussians::empty(2),
+    ];
+    let mut changed = gaussians.clone();
+    for (number, change) in changes.iter().enumerate() {
+        let before = last.take_over(device, &changed).unwrap();
+        change(&mut changed);
+        let after = last.take_over(device, &changed).unwrap();
+        assert!(!Arc::ptr_eq(&before, &after), "change {number}");
+        assert!(Arc::ptr_eq(&after, &last.take_over(device, &changed).unwrap()), "change {number}");
+    }
+    // Colours from the side matter to no footprint.
+    let seen = last.take_over(device, &gaussians).unwrap();
+    let mut other = gaussians.clone();
+    other.sh[27 * 30 + 5] += 1.0;
+    assert!(Arc::ptr_eq(&seen, &last.take_over(device, &other).unwrap()));
+    other.sh.pop();
+    assert!(last.take_over(device, &other).is_err(), "a set without its last coefficient");
 }

@@ -79,6 +79,9 @@ fn one_gaussian_and_none_are_drawn_alike() {
     let nothing = gpu.render(&Gaussians::empty(3), camera, BACKGROUND).unwrap();
     assert_eq!(nothing.image, Image::filled(17, 13, BACKGROUND));
     assert!(nothing.alpha.iter().all(|&alpha| alpha == 0.0));
+    let seeds = seeds(3 * 17 * 13);
+    let gradients = gpu.render_backward(&Gaussians::empty(3), camera, BACKGROUND, &seeds, &[]).unwrap();
+    assert!(gradients.means.is_empty() && gradients.sh.is_empty());
 }
 
 #[test]
@@ -230,4 +233,63 @@ fn a_camera_without_pixels_is_refused() {
         let refused = gpu.render(&blobs(3, 1, 1), &camera, BACKGROUND);
         assert!(matches!(refused, Err(EngineError::InvalidInput(_))), "{width}x{height}");
     }
+}
+
+#[test]
+fn a_camera_beyond_all_memory_is_refused_with_figures() {
+    let Some(gpu) = engine() else { return };
+    // In the last two, bytes or tiles exceed what counts them.
+    for (width, height) in [(1 << 20, 1 << 20), (1 << 30, 1 << 30), (u32::MAX, u32::MAX)] {
+        let camera = Camera { width, height, ..arc(1, 17, 17).swap_remove(0) };
+        let refused = gpu.render(&blobs(3, 1, 1), &camera, BACKGROUND);
+        assert!(matches!(refused, Err(EngineError::OutOfResources { .. })), "{width}x{height}");
+    }
+    // The device is as it was.
+    assert_drawn_alike("after a refusal", &blobs(30, 1, 1), &arc(1, 17, 17)[0]);
+}
+
+#[test]
+fn gradients_by_another_number_of_pixels_are_refused() {
+    let Some(gpu) = engine() else { return };
+    let (gaussians, camera) = (blobs(3, 1, 1), &arc(1, 17, 13)[0]);
+    let pixels = 17 * 13;
+    for (image, alpha) in [(3 * pixels - 1, 0), (3 * pixels + 3, 0), (0, 0), (3 * pixels, 1)] {
+        let refused =
+            gpu.render_backward(&gaussians, camera, BACKGROUND, &vec![1.0; image], &vec![1.0; alpha]);
+        assert!(matches!(refused, Err(EngineError::InvalidInput(_))), "{image} values, {alpha} alphas");
+    }
+}
+
+#[test]
+fn more_intersections_than_32_bits_count_are_refused() {
+    let Some(gpu) = engine() else { return };
+    // 65 538 tiles beside each other, all of them reached by each of 70 000 Gaussians: 4.6e9.
+    let camera = &arc(1, 16 * 65_538, 3)[0];
+    let mut gaussians = blobs(70_000, 0, 23);
+    gaussians.log_scales.fill([8.0; 3]);
+    match gpu.render(&gaussians, camera, BACKGROUND) {
+        Err(EngineError::OutOfResources { needed, .. }) => assert_eq!(needed, 4 * u64::from(u32::MAX)),
+        other => panic!("{:?}", other.map(|drawn| drawn.alpha.len())),
+    }
+}
+
+#[test]
+fn arrays_of_different_lengths_are_refused() {
+    let Some(gpu) = engine() else { return };
+    let camera = &arc(1, 17, 13)[0];
+    let breaks: [fn(&mut Gaussians); 5] = [
+        |g| g.rotations.truncate(2),
+        |g| g.log_scales.push([0.0; 3]),
+        |g| g.logit_opacities.clear(),
+        |g| g.sh.truncate(5),
+        |g| g.sh.extend([0.0; 1000]),
+    ];
+    for (number, change) in breaks.iter().enumerate() {
+        let mut gaussians = blobs(3, 1, 1);
+        change(&mut gaussians);
+        let refused = gpu.render(&gaussians, camera, BACKGROUND).err();
+        assert!(matches!(refused, Some(EngineError::InvalidInput(_))), "change {number}: {refused:?}");
+    }
+    // The device is as it was.
+    assert_drawn_alike("after refusals", &blobs(30, 1, 1), camera);
 }
