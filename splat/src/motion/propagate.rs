@@ -92,7 +92,7 @@ impl Context<'_> {
             let side = if mean.dot(turn) < 0.0 { -1.0 } else { 1.0 };
             let error = states[member.index].rotation_error;
             let error = error.x_axis.x + error.y_axis.y + error.z_axis.z + deviation * deviation;
-            mean = mean + turn * (side * member.affinity / error.max(f64::MIN_POSITIVE));
+            mean += turn * (side * member.affinity / error.max(f64::MIN_POSITIVE));
         }
         let is_turned = mean.xyz() != DVec3::ZERO && mean.length_squared() > 0.0 && mean.is_finite();
         let rotation = if is_turned { mean.normalize() } else { DQuat::IDENTITY };
