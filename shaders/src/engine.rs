@@ -157,17 +157,19 @@ impl GpuEngine {
         view: &ViewBuffer,
         buffers: Buffers,
     ) -> Result<Buffers, EngineError> {
-        self.run(gaussians, view, buffers, |binder, buffers, view| binder.forward(buffers, view))
+        let (buffers, _) =
+            self.run(gaussians, view, buffers, |binder, buffers, view| binder.forward(buffers, view))?;
+        Ok(buffers)
     }
 
-    /// Stages of a view, the lists among them, with more room until there is enough.
+    /// Stages of a view, the lists among them, with more room until there is enough; says how many intersections there are.
     pub(crate) fn run(
         &self,
         gaussians: &Gaussians,
         view: &ViewBuffer,
         mut buffers: Buffers,
         stages: fn(&Binder<'_>, &Buffers, &ViewBuffer) -> Vec<Dispatch>,
-    ) -> Result<Buffers, EngineError> {
+    ) -> Result<(Buffers, u32), EngineError> {
         let Context { device, kernels, .. } = &*self.context;
         loop {
             let step = Step {
@@ -185,7 +187,7 @@ impl GpuEngine {
             device.queue.submit([encoder.finish()]);
             let state: Vec<State> = read(device, &buffers.common.state, 1)?;
             if state[0].failed == 0 {
-                return Ok(buffers);
+                return Ok((buffers, state[0].needed));
             }
             let size = buffers.size.with_room(device, state[0].needed)?;
             admit(device, &Buffers::requests(&size))?;

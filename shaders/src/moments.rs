@@ -15,7 +15,7 @@ use splat::{
 };
 
 use crate::{
-    buffers::{Buffers, MomentBuffers, ParameterBuffers, admit, parameters::check_lengths},
+    buffers::{Buffers, MomentBuffers, ParameterBuffers, Size, admit, parameters::check_lengths},
     device::GpuDevice,
     engine::{Context, GpuEngine},
     layout::{Expectation, Moments, View},
@@ -47,13 +47,13 @@ pub(crate) fn footprint_moments(
     let size = engine.size(gaussians.len(), 1, &view.data, false)?;
     let measured = engine.context.measured.take_over(device, gaussians)?;
     let buffers = Buffers::new(device, measured.parameters.clone(), &size)?;
-    let buffers = engine
-        .run(&measured.colourless, &view, buffers, |binder, buffers, view| binder.lists(buffers, view))?;
-    admit(
-        device,
-        &[Buffers::requests(&buffers.size), MomentBuffers::requests(&buffers.size).to_vec()].concat(),
-    )?;
-    let tracks = MomentBuffers::new(device, &buffers.size, tracks)?;
+    let (buffers, intersections) =
+        engine
+            .run(&measured.colourless, &view, buffers, |binder, buffers, view| binder.lists(buffers, view))?;
+    // Sums are the largest buffer by far, and by now it is known how many there are.
+    let of_lists = Size { capacity: intersections.into(), ..buffers.size };
+    admit(device, &[Buffers::requests(&buffers.size), MomentBuffers::requests(&of_lists).to_vec()].concat())?;
+    let tracks = MomentBuffers::new(device, &of_lists, tracks)?;
     let measurement = Measurement { context: &engine.context, view, buffers, tracks };
     let (expectations, all) = every(gaussians.len());
     let mut moments = measurement.pass(&expectations, &all)?;
@@ -77,8 +77,8 @@ pub(crate) struct Measured {
     parameters: ParameterBuffers,
 }
 
-/// The set that was measured last. Views of one moment see the same Gaussians, and to compare a set takes a fifth of what
-/// it takes to upload it, or less.
+/// The set that was measured last. Views of one moment see the same Gaussians, and comparing a set takes a fifth of the time
+/// that uploading it takes, or less.
 #[derive(Debug, Default)]
 pub(crate) struct LastMeasured(Mutex<Option<Arc<Measured>>>);
 

@@ -33,8 +33,8 @@ impl MomentBuffers {
             storage("deviations of tracks", 4 * pixels),
             storage("expectations", size_of::<Expectation>() as u64 * count),
             storage("wanted footprints", 4 * (count + 1)),
-            storage("sums of tiles", record * capacity),
             // A binding holds one at least.
+            storage("sums of tiles", record * capacity.max(1)),
             storage("moments", record * count.max(1)),
         ]
     }

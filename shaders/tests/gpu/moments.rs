@@ -9,7 +9,9 @@ use splat::{
     tracking::TrackField,
 };
 
-use crate::support::{arc, blobs, engine, rough_tracks};
+use splat_shaders::GpuEngine;
+
+use crate::support::{arc, blobs, engine, open, rough_tracks};
 
 const REWEIGHTING: Reweighting = Reweighting { passes: 3, noise_correlation_area: 1.0, noise_floor: 0.05 };
 
@@ -214,4 +216,21 @@ fn tracks_of_another_size_are_refused() {
     let tracks = rough_tracks(&arc(1, 17, 12)[0], 0.0, 1);
     let refused = gpu.footprint_moments(&blobs(3, 0, 1), &arc(1, 17, 13)[0], &tracks, None);
     assert!(matches!(refused, Err(EngineError::InvalidInput(_))), "{refused:?}");
+}
+
+#[test]
+fn sums_take_the_room_of_the_intersections_that_there_are() {
+    let Some(_) = engine() else { return };
+    let camera = &arc(1, 17, 13)[0];
+    let mut gaussians = blobs(20_000, 0, 11);
+    // All but a few are behind the camera.
+    gaussians.means[20..].iter_mut().for_each(|mean| mean[2] = -100.0);
+    // Sums for the 80 000 intersections for which lists have room at first would be 6.4 MB, all else is below 7.
+    let limited = GpuEngine::new(open().with_memory_limit(8_000_000)).unwrap();
+    let tracks = rough_tracks(camera, 11.0, 11);
+    let ours = limited.footprint_moments(&gaussians, camera, &tracks, None).unwrap();
+    assert!(ours.iter().filter(|moments| moments.pixels > 0).count() > 5);
+    let too_much = GpuEngine::new(open().with_memory_limit(1_000_000)).unwrap();
+    let refused = too_much.footprint_moments(&gaussians, camera, &tracks, None);
+    assert!(matches!(refused, Err(EngineError::OutOfResources { .. })), "{refused:?}");
 }
