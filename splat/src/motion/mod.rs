@@ -62,8 +62,8 @@ use value_order::ValueOrder;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MotionOrigin {
-    /// Its footprints do not move beyond the track noise; or those of its neighbours do not, where its own views say
-    /// nothing against it but do not determine where it is.
+    /// Its footprints do not move beyond the track noise; or, where a single view or none finds it so, those of its neighbours
+    /// do not.
     Static,
     /// Solved from its own footprints.
     Solved,
@@ -207,8 +207,9 @@ fn solve_alone(
         })
         .collect();
     let resting = |voters: Vec<usize>| {
+        // However badly two views tell the depth of what does not move for either, a motion along both rays is less likely.
+        let is_determined = voters.len() > 1;
         let own = lift::at_rest(&sightings, voters, mean, settings);
-        let is_determined = own.as_ref().is_some_and(|own| own.is_determined);
         let origin = if is_determined { MotionOrigin::Static } else { MotionOrigin::Unsolved };
         State { is_seen_at_rest: true, ..State::unmoved(origin, own) }
     };

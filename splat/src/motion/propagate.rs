@@ -192,7 +192,7 @@ pub(super) fn accept_doubted(states: &mut [State]) -> bool {
     any
 }
 
-/// Lets Gaussians rest that their own views see at rest without determining where they are, and of which no neighbour
+/// Lets Gaussians rest that a single view sees at rest, and of which no neighbour
 /// knows better; whether there are any.
 pub(super) fn accept_resting(states: &mut [State]) -> bool {
     let mut any = false;

@@ -83,8 +83,7 @@ pub struct MotionSettings {
     /// surface.
     #[serde(deserialize_with = "range::magnitude")]
     pub outlier_floor: f64,
-    /// Largest standard deviation of a position that a Gaussian's own views determine, be it at rest or not, as a share of its
-    /// depth; default 0.02. Beyond it the
+    /// Largest standard deviation of a solved position, as a share of its depth; default 0.02. Beyond it the
     /// neighbours decide: footprints that straddle two motions know neither.
     #[serde(deserialize_with = "range::magnitude")]
     pub max_relative_deviation: f64,
