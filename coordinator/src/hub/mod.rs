@@ -176,6 +176,10 @@ impl Hub {
 
     /// The coordinator cannot go on: it ends, and a restart goes on from what is written.
     pub(crate) fn fail(&self, error: StoreError) {
+        if error.is_closed() {
+            // Only this coordinator closes its state, after it was asked to end: a request that came too late.
+            return;
+        }
         tracing::error!(%error, "the coordinator's state cannot be read or written; shutting down");
         let mut fatal = self.fatal.lock().unwrap_or_else(PoisonError::into_inner);
         fatal.get_or_insert(error);

@@ -48,6 +48,13 @@ pub enum StoreError {
     },
 }
 
+impl StoreError {
+    /// Whether the state was closed before the request came.
+    pub fn is_closed(&self) -> bool {
+        matches!(self, Self::Database(sqlx::Error::PoolClosed))
+    }
+}
+
 /// The state on disk. Cheap to clone.
 #[derive(Clone, Debug)]
 pub struct Store {

@@ -94,6 +94,15 @@ async fn a_reopened_file_holds_what_was_committed_and_nothing_else() {
 }
 
 #[tokio::test]
+async fn a_change_that_comes_after_the_end_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = open(&folder).await;
+    store.close().await;
+    let error = store.change().await.err().unwrap();
+    assert!(error.is_closed(), "{error}");
+}
+
+#[tokio::test]
 async fn events_count_up_from_one_per_job_without_gaps() {
     let folder = tempfile::tempdir().unwrap();
     let store = open(&folder).await;
