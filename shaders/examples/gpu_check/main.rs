@@ -97,14 +97,13 @@ fn run(arguments: &Arguments) -> Result<bool> {
 }
 
 fn open(device: &str) -> Result<GpuDevice> {
-    let choice = match device.strip_prefix("gpu:").and_then(|number| number.parse().ok()) {
-        Some(index) => DeviceChoice::Index(index),
-        None if device != "auto" => DeviceChoice::Name(device.to_owned()),
-        None => match GpuDevice::open(&DeviceChoice::Auto) {
+    let choice = match device {
+        "auto" => match GpuDevice::open(&DeviceChoice::Auto) {
             Ok(device) => return Ok(device),
             // Software if there is any; else the error says what is there.
             Err(_) => devices().first().map_or(DeviceChoice::Auto, |first| DeviceChoice::Index(first.index)),
         },
+        one => DeviceChoice::written(one),
     };
     Ok(GpuDevice::open(&choice)?)
 }

@@ -25,6 +25,16 @@ pub enum DeviceChoice {
     },
 }
 
+impl DeviceChoice {
+    /// As people write one of them: `gpu:N` by its number, everything else by its name.
+    pub fn written(text: &str) -> Self {
+        match text.strip_prefix("gpu:").and_then(|number| number.parse().ok()) {
+            Some(index) => Self::Index(index),
+            None => Self::Name(text.to_owned()),
+        }
+    }
+}
+
 impl fmt::Display for DeviceChoice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -198,6 +208,14 @@ mod tests {
         // Where drivers say no bus the number is all there is.
         let silent = [at(0, ""), at(1, "")];
         assert_eq!(chosen(&silent[1].itself(), &silent), Some(1));
+    }
+
+    #[test]
+    fn a_number_is_written_after_gpu_and_all_else_is_a_name() {
+        assert_eq!(DeviceChoice::written("gpu:2"), DeviceChoice::Index(2));
+        for name in ["llvmpipe", "gpu:", "gpu:x"] {
+            assert_eq!(DeviceChoice::written(name), by_name(name));
+        }
     }
 
     #[test]

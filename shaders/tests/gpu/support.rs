@@ -59,10 +59,7 @@ pub(crate) fn open() -> GpuDevice {
 fn choice() -> Option<DeviceChoice> {
     match std::env::var("TRACKERSPLAT_TEST_DEVICE").as_deref() {
         Ok("none") => None,
-        Ok(name) => Some(match name.strip_prefix("gpu:").and_then(|number| number.parse().ok()) {
-            Some(index) => DeviceChoice::Index(index),
-            None => DeviceChoice::Name(name.to_owned()),
-        }),
+        Ok(one) => Some(DeviceChoice::written(one)),
         Err(_) if GpuDevice::open(&DeviceChoice::Auto).is_ok() => Some(DeviceChoice::Auto),
         Err(_) => Some(DeviceChoice::Index(devices().first().map_or(0, |device| device.index))),
     }

@@ -104,11 +104,7 @@ pub(super) fn fit(
         && displacement.length_squared() <= still
         && candidates.is_rigid(resting, independent_pixels, settings);
 
-    let has_map = footprint.source.determinant() > LEAST_EXTENT * trace(footprint.source);
-    let (strain, affine_covariance) = match has_map {
-        true => (footprint.strain * footprint.source.inverse(), footprint.source.inverse() * pixel_variance),
-        false => (DMat2::ZERO, DMat2::from_diagonal(DVec2::splat(NO_MAP))),
-    };
+    let (affine, affine_covariance) = affine_map(&footprint, pixel_variance);
     let fit = Fit {
         target: projected_mean + displacement,
         variance: variance + floor + wrong_surface,
@@ -116,10 +112,19 @@ pub(super) fn fit(
         doubt: if contest.kept > 0.5 { wrong_surface / total } else { 0.0 },
         order: if is_static { Order::Static } else { order },
         gradient: DMat2::IDENTITY + candidates.gradient(order),
-        affine: DMat2::IDENTITY + strain,
+        affine,
         affine_covariance,
     };
     fit.is_finite().then_some(fit)
+}
+
+/// The affine part by least squares, and the covariance of a row of it.
+fn affine_map(footprint: &Displacements, pixel_variance: f64) -> (DMat2, DMat2) {
+    let source = footprint.source;
+    match source.determinant() > LEAST_EXTENT * trace(source) {
+        true => (DMat2::IDENTITY + footprint.strain * source.inverse(), source.inverse() * pixel_variance),
+        false => (DMat2::IDENTITY, DMat2::from_diagonal(DVec2::splat(NO_MAP))),
+    }
 }
 
 /// Whether enough of the footprint is seen at both frames.

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::{
     MotionOrigin, MotionSettings,
     lift::Lift,
-    linear::solve,
+    linear::{solve, trace},
     neighbours::{Neighbour, Neighbourhood},
     rotation::{Expectation, Member, RigidMotion, fit_rigid_motion},
 };
@@ -90,8 +90,7 @@ impl Context<'_> {
             let turn = states[member.index].rotation;
             // `q` and `-q` are the same rotation.
             let side = if mean.dot(turn) < 0.0 { -1.0 } else { 1.0 };
-            let error = states[member.index].rotation_error;
-            let error = error.x_axis.x + error.y_axis.y + error.z_axis.z + deviation * deviation;
+            let error = trace(states[member.index].rotation_error) + deviation * deviation;
             mean += turn * (side * member.affinity / error.max(f64::MIN_POSITIVE));
         }
         let is_turned = mean.xyz() != DVec3::ZERO && mean.length_squared() > 0.0 && mean.is_finite();
@@ -174,7 +173,7 @@ pub(super) fn retract_unverified(states: &mut [State], context: &Context<'_>) {
 fn deviation(state: &State) -> f64 {
     let Some(own) = &state.own else { return 0.0 };
     let covariance = own.information.inverse();
-    let trace = covariance.x_axis.x + covariance.y_axis.y + covariance.z_axis.z;
+    let trace = trace(covariance);
     if trace.is_finite() { 3.0 * trace.max(0.0).sqrt() } else { 0.0 }
 }
 
@@ -192,8 +191,7 @@ pub(super) fn accept_doubted(states: &mut [State]) -> bool {
     any
 }
 
-/// Lets Gaussians rest that a single view sees at rest, and of which no neighbour
-/// knows better; whether there are any.
+/// Lets Gaussians rest that a single view sees at rest, and of which no neighbour knows better; whether there are any.
 pub(super) fn accept_resting(states: &mut [State]) -> bool {
     let mut any = false;
     for state in states.iter_mut().filter(|state| !state.is_known() && state.is_seen_at_rest) {

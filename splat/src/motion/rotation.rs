@@ -5,7 +5,7 @@ use glam::{DMat3, DQuat, DVec3};
 use super::{
     MotionSettings,
     fit2d::Fit,
-    linear::{cross_matrix, outer},
+    linear::{cross_matrix, outer, trace},
 };
 use crate::{cameras::Camera, gaussians::Gaussians};
 
@@ -251,7 +251,7 @@ impl System {
     /// Inverse of the translation block; a tiny share of its trace stands in where no member sees a
     /// direction.
     fn translation_covariance(&self) -> DMat3 {
-        let trace = self.translation.diagonal().element_sum();
+        let trace = trace(self.translation);
         if !trace.is_normal() {
             return DMat3::ZERO;
         }
@@ -347,7 +347,7 @@ fn lift_axis(
         right += (new_u * (seen.x - new_u.dot(axis)) + new_v * (seen.y - new_v.dot(axis))) * variance.recip();
     }
     // Relative to the information itself, so that it only decides what nothing else does.
-    let trace = information.x_axis.x + information.y_axis.y + information.z_axis.z;
+    let trace = trace(information);
     let ridge = DMat3::from_diagonal(DVec3::splat(1e-9 * trace));
     let to = axis + (information + ridge).inverse() * right;
     let is_lifted = trace > 0.0 && to.is_finite() && information.is_finite() && to.length_squared() > 0.0;

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::{
     MotionOrigin, MotionSettings, MotionView,
+    linear::trace,
     observe::Observation,
     propagate::{Context, State},
     rotation::significant_share,
@@ -102,9 +103,8 @@ impl Line {
         let misfit = (chi_squared / (2.0 * sights.len() as f64 - 1.0)).max(1.0);
         let by_turn = by_turn / information;
         // A line seen face-on foreshortens by half of the square of its tilt.
-        let error = self.turn_error;
-        let by_tilt = 0.5 * (error.x_axis.x + error.y_axis.y + error.z_axis.z);
-        let by_turn = by_turn.dot(error * by_turn) + by_tilt * by_tilt;
+        let by_tilt = 0.5 * trace(self.turn_error);
+        let by_turn = by_turn.dot(self.turn_error * by_turn) + by_tilt * by_tilt;
         let variance = misfit / (information * stretch * stretch) + by_turn;
         (stretch > 0.0 && variance.is_finite()).then(|| (stretch.ln(), variance))
     }
