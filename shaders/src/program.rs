@@ -1,8 +1,8 @@
 //! A fixed list of dispatches, recorded again for every step.
 
-use wgpu::{BindGroup, Buffer, CommandEncoder, ComputePassDescriptor, ComputePassTimestampWrites};
+use wgpu::{BindGroup, CommandEncoder, ComputePassDescriptor, ComputePassTimestampWrites};
 
-use crate::kernels::Kernel;
+use crate::{buffers::Buffer, kernels::Kernel};
 
 /// How many workgroups a dispatch has.
 #[derive(Clone, Debug)]

@@ -2,11 +2,11 @@
 
 use bytemuck::bytes_of;
 use splat::engine::EngineError;
-use wgpu::{BindingResource, Buffer};
+use wgpu::BindingResource;
 
 use crate::{
     buffers::{
-        BLOCK, Buffers, CommonBuffers, DEPTH_PASSES, DIGITS, GradientBuffers, IntersectionBuffers,
+        BLOCK, Buffer, Buffers, CommonBuffers, DEPTH_PASSES, DIGITS, GradientBuffers, IntersectionBuffers,
         MomentBuffers, SortBuffers, allocate, uniform,
     },
     device::GpuDevice,

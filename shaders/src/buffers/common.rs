@@ -2,9 +2,9 @@
 
 use bytemuck::{Pod, bytes_of};
 use splat::engine::EngineError;
-use wgpu::{BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages};
+use wgpu::{BindingResource, BufferBinding, BufferSize, BufferUsages};
 
-use super::{Request, allocate, storage, uniform};
+use super::{Buffer, Request, allocate, storage, uniform};
 use crate::{
     device::GpuDevice,
     layout::{ScanSettings, SortSettings, State, Step},

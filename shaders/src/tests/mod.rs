@@ -7,6 +7,7 @@
 
 mod layout;
 mod lost;
+mod memory;
 mod moments;
 mod optimisation;
 mod projection;

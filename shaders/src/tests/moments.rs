@@ -18,8 +18,8 @@ use crate::{
     GpuEngine,
     layout::{TILE, View},
     moments::LastMeasured,
-    readback::read,
     stages::{ViewBuffer, sorted_slots},
+    transfer::read,
 };
 
 /// A pixel of a footprint: its weight `alpha · T`, inverse variance, position and displacement.

@@ -18,9 +18,9 @@ use super::{
 use crate::{
     buffers::{GradientBuffers, LossBuffers, OptimiserBuffers, parameters::interleaved, separated},
     layout::{GEOMETRY, State, Step, View},
-    readback::read,
     session::{SessionView, session_view},
     stages::Binder,
+    transfer::read,
 };
 
 /// Values about and beyond [0, 1].

@@ -7,8 +7,8 @@ use super::support::{self, arc, blobs};
 use crate::{
     buffers::Buffers,
     layout::{TILE, View},
-    readback::read,
     stages::{ViewBuffer, sorted_slots, tile_passes},
+    transfer::read,
 };
 
 /// The ellipse of a Gaussian whose Jacobian is not clamped.

@@ -10,8 +10,8 @@ use crate::{
     engine::Context,
     layout::State,
     program::Groups,
-    readback::read,
     stages::Binder,
+    transfer::read,
 };
 
 /// Around the ends of a thread's share, of a block, and of what the spine takes at a time.
