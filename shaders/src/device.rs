@@ -58,6 +58,12 @@ pub struct DeviceDescription {
 /// Why no device was opened.
 #[derive(Debug, Error)]
 pub enum DeviceError {
+    /// Nobody can say what is meant.
+    #[error("`{text}` is neither the number of a GPU, such as gpu:0, nor a part of a name")]
+    Unreadable {
+        /// What was written.
+        text: String,
+    },
     /// Nothing fits.
     #[error("no GPU fits `{choice}`; this machine has: {found}")]
     NotFound {

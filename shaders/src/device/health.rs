@@ -107,6 +107,12 @@ impl GpuDevice {
         self.check()
     }
 
+    /// As if the driver had said so.
+    #[cfg(test)]
+    pub(crate) fn lose(&self, said: &str) {
+        self.health.lose(Loss::said(said.to_owned()));
+    }
+
     /// Counts the device as lost. To free a queue is to wait for it, so that one which does not end is never freed.
     fn give_up(&self) {
         let seconds = self.patience.as_secs_f64();

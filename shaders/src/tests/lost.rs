@@ -8,7 +8,7 @@ use splat::{
     optim::LearningRates,
 };
 
-use wgpu::{BufferDescriptor, BufferUsages, PollError, PollType};
+use wgpu::{BufferUsages, PollError, PollType};
 
 use super::support::{arc, blobs, engine, open};
 use crate::{
@@ -114,21 +114,20 @@ fn a_broken_rule_fails_who_broke_it_and_nobody_else() {
 }
 
 #[test]
-fn a_driver_without_memory_is_out_of_resources() {
-    let Some(engine) = engine() else { return };
-    let device = &engine.context.device;
-    let outcome: Result<(), _> = device.guarded(|| {
-        // Within all limits, and more than there is.
-        let huge = device.device.create_buffer(&BufferDescriptor {
-            label: None,
-            size: device.device.limits().max_buffer_size & !3,
-            usage: BufferUsages::STORAGE,
-            mapped_at_creation: false,
-        });
-        huge.destroy();
-        Ok(())
-    });
-    println!("{outcome:?}");
-    assert!(matches!(outcome, Ok(()) | Err(EngineError::OutOfResources { available: 0, .. })), "{outcome:?}");
-    engine.check().unwrap();
+fn a_device_that_is_lost_for_want_of_memory_is_out_of_resources() {
+    if engine().is_none() {
+        return;
+    }
+    let doomed = GpuEngine::new(open()).unwrap();
+    let mut session = doomed.session(input()).unwrap();
+    let held = doomed.context.device.account().held();
+    doomed.context.device.lose(&wgpu::hal::DeviceError::OutOfMemory.to_string());
+    for outcome in [doomed.check(), session.step(0, &RATES)] {
+        assert!(
+            matches!(outcome, Err(EngineError::OutOfResources { needed, available: 0 }) if needed == held),
+            "{outcome:?}"
+        );
+    }
+    let text = doomed.check().unwrap_err().to_string();
+    assert!(text.contains(&format!("{held} bytes")) && text.contains("grants no more"), "{text}");
 }

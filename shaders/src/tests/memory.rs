@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use splat::{
-    engine::{Engine, EngineError, Session, SessionInput, TrainingView},
+    engine::{Engine, EngineError, SessionInput, TrainingView},
     gaussians::Gaussians,
     image::Image,
     optim::LearningRates,
