@@ -28,8 +28,11 @@ pub(crate) struct CommonBuffers {
 
 impl CommonBuffers {
     pub(crate) fn new(device: &GpuDevice) -> Result<Self, EngineError> {
-        let indirect =
-            Request { label: "dispatches", bytes: 32, usage: BufferUsages::STORAGE | BufferUsages::INDIRECT };
+        let indirect = Request {
+            label: "dispatches",
+            bytes: 32,
+            usage: BufferUsages::STORAGE | BufferUsages::INDIRECT | BufferUsages::COPY_SRC,
+        };
         let requests = [
             uniform("step", size_of::<Step>() as u64),
             storage("state", size_of::<State>() as u64),

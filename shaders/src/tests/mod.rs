@@ -12,6 +12,7 @@ mod moments;
 mod optimisation;
 mod projection;
 mod sorting;
+mod stages;
 #[path = "../../tests/gpu/support.rs"]
 pub(crate) mod support;
 
