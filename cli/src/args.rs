@@ -16,7 +16,7 @@ use splat::{
 use trackersplat_proto::v1::{ExactTracks, SubmitRequest, TrackFiles, submit_request::Tracks};
 
 use crate::{
-    device::{DeviceArg, Placement, gpu_engine},
+    device::{DeviceArg, Placement, gpu_engine, share_of_memory},
     error::CliError,
     frame_range::FrameRange,
     layers::SettingsLayers,
@@ -208,6 +208,13 @@ pub(crate) struct EngineArgs {
     /// `--device cpu`.
     #[arg(long, value_name = "SET", help_heading = "Execution")]
     pub(crate) instructions: Option<InstructionSet>,
+
+    /// MiB of the GPU's memory that this process takes at most [default: all; workers that this program starts on one GPU divide it].
+    ///
+    /// A job that needs more fails as out of resources. For workers of several programs on one GPU whose driver does not say what
+    /// the others have.
+    #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Execution")]
+    pub(crate) device_memory: Option<u32>,
 }
 
 /// One worker process.
@@ -229,7 +236,9 @@ impl EngineArgs {
     pub(crate) fn engine_on(&self, placement: &Placement) -> Result<Arc<dyn Engine>, CliError> {
         match placement {
             // The best comes first.
-            Placement::Gpus(gpus) => gpu_engine(gpus.first().copied().unwrap_or_default()),
+            Placement::Gpus(gpus) => {
+                gpu_engine(gpus, self.device_memory.map(|mebibytes| u64::from(mebibytes) << 20))
+            }
             Placement::Cpu => Ok(Arc::new(self.cpu_engine()?)),
         }
     }
@@ -253,11 +262,24 @@ impl EngineArgs {
                 let count = asked.unwrap_or(gpus.len());
                 let one = |gpu: &usize| WorkerSetup {
                     threads: (cores / count).max(1),
-                    arguments: vec![format!("--device=gpu:{gpu}")],
+                    arguments: [
+                        Some(format!("--device=gpu:{gpu}")),
+                        self.memory_of_a_worker(*gpu, count.div_ceil(gpus.len())),
+                    ]
+                    .into_iter()
+                    .flatten()
+                    .collect(),
                 };
                 gpus.iter().cycle().take(count).map(one).collect()
             }
         }
+    }
+
+    /// What a worker is told of its GPU's memory, one of so many on it.
+    fn memory_of_a_worker(&self, gpu: usize, workers: usize) -> Option<String> {
+        let shared = || if workers > 1 { share_of_memory(gpu, workers) } else { None };
+        let mebibytes = self.device_memory.map(u64::from).or_else(shared)?;
+        Some(format!("--device-memory={mebibytes}"))
     }
 
     /// The devices that are meant, on this machine.
@@ -364,6 +386,9 @@ mod tests {
         assert_eq!(arguments(&three), ["--device=gpu:2", "--device=gpu:0", "--device=gpu:2"]);
         assert_eq!(three[0].threads, 1);
         assert!(args.workers(&gpus, Some(0), 16, 16).is_empty());
+        let limited = EngineArgs { device_memory: Some(512), ..EngineArgs::default() };
+        let second = limited.workers(&gpus, None, 16, 16).swap_remove(1);
+        assert_eq!(second.arguments, ["--device=gpu:0", "--device-memory=512"]);
         let cpu = args.workers(&Placement::Cpu, None, 3, 16);
         assert_eq!(arguments(&cpu), ["--device=cpu"; 3]);
         assert_eq!(cpu[0].threads, 1);
@@ -372,8 +397,11 @@ mod tests {
 
     #[test]
     fn instructions_are_the_processors() {
-        let baseline =
-            |device: DeviceArg| EngineArgs { device, instructions: Some(InstructionSet::Baseline) };
+        let baseline = |device: DeviceArg| EngineArgs {
+            device,
+            instructions: Some(InstructionSet::Baseline),
+            device_memory: None,
+        };
         for device in [DeviceArg::Auto, DeviceArg::Cpu] {
             let args = baseline(device);
             assert_eq!(args.engine().unwrap().name(), "cpu");

@@ -49,6 +49,7 @@ impl From<EngineError> for StageError {
             EngineError::InvalidInput(_) => FailureKind::BadInput,
             EngineError::OutOfResources { .. } => FailureKind::OutOfResources,
             EngineError::DeviceLost(_) => FailureKind::Transient,
+            EngineError::Internal(_) => FailureKind::Bug,
         };
         Self::new(kind, error.to_string())
     }

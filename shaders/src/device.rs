@@ -1,17 +1,20 @@
 //! Which devices there are, and one of them opened.
 
+mod account;
 mod choice;
+mod health;
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::{sync::Arc, time::Duration};
 
-use splat::engine::EngineError;
 use thiserror::Error;
 use wgpu::{
     Adapter, Backends, Device, DeviceDescriptor, DeviceType, Features, Instance, InstanceDescriptor,
-    InstanceFlags, Limits, Queue,
+    InstanceFlags, Limits, MemoryBudgetThresholds, Queue,
 };
 
+pub(crate) use self::account::{Account, Reservation};
 pub use self::choice::{DeviceChoice, choose, real_gpus};
+use self::health::{Health, Poll};
 
 /// What sort of device it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,6 +58,12 @@ pub struct DeviceDescription {
 /// Why no device was opened.
 #[derive(Debug, Error)]
 pub enum DeviceError {
+    /// Nobody can say what is meant.
+    #[error("`{text}` is neither the number of a GPU, such as gpu:0, nor a part of a name")]
+    Unreadable {
+        /// What was written.
+        text: String,
+    },
     /// Nothing fits.
     #[error("no GPU fits `{choice}`; this machine has: {found}")]
     NotFound {
@@ -198,6 +207,11 @@ fn adapters() -> Vec<Adapter> {
     descriptor.backends = Backends::VULKAN | Backends::METAL | Backends::DX12;
     // Indirect dispatches are written by `plan` alone, within the limits; wgpu's own check is a dispatch for each.
     descriptor.flags = InstanceFlags::empty();
+    // Other processes take memory of the same device. Where the driver says how much of it this one may have at present (Vulkan with
+    // VK_EXT_memory_budget, DirectX 12), a buffer beyond it is refused; else the driver may grant more than there is and
+    // move it to the host, or lose the device.
+    descriptor.memory_budget_thresholds =
+        MemoryBudgetThresholds { for_resource_creation: Some(SHARE_OF_BUDGET), for_device_loss: None };
     pollster::block_on(Instance::new(descriptor).enumerate_adapters(Backends::all()))
 }
 
@@ -205,12 +219,8 @@ fn adapters() -> Vec<Adapter> {
 /// threads of the form without (`wgsl/shared/group_scan.wgsl`).
 const WORTHWHILE_SUBGROUP: u32 = 16;
 
-/// What went wrong on a device outside of the calls that return errors.
-#[derive(Debug, Default)]
-struct Fault {
-    lost: Option<String>,
-    error: Option<String>,
-}
+/// Per cent of what the driver says a process may have: the rest is for what the driver takes itself.
+const SHARE_OF_BUDGET: u8 = 97;
 
 /// An opened device.
 #[derive(Debug)]
@@ -220,9 +230,11 @@ pub struct GpuDevice {
     description: DeviceDescription,
     label: String,
     limits: Limits,
-    memory_limit: Option<u64>,
+    account: Arc<Account>,
     uses_subgroups: bool,
-    fault: Arc<Mutex<Fault>>,
+    health: Arc<Health>,
+    patience: Duration,
+    poll: Poll,
 }
 
 impl GpuDevice {
@@ -258,25 +270,36 @@ impl GpuDevice {
         })?;
         let uses_subgroups = device.features().contains(Features::SUBGROUP)
             && adapter.get_info().subgroup_min_size >= WORTHWHILE_SUBGROUP;
-        let fault = Arc::new(Mutex::new(Fault::default()));
-        let lost = Arc::clone(&fault);
-        device.set_device_lost_callback(move |_, message| {
-            let mut fault = lost.lock().unwrap_or_else(PoisonError::into_inner);
-            fault.lost.get_or_insert(message);
-        });
-        let failed = Arc::clone(&fault);
-        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
-            let mut fault = failed.lock().unwrap_or_else(PoisonError::into_inner);
-            fault.error.get_or_insert(error.to_string());
-        }));
-        let (label, memory_limit) = (description.label(), description.memory);
-        Ok(Self { device, queue, description, label, limits, memory_limit, uses_subgroups, fault })
+        Ok(Self {
+            health: Health::of(&device),
+            device,
+            queue,
+            label: description.label(),
+            limits,
+            account: Account::new(description.memory),
+            uses_subgroups,
+            patience: health::patience(description.kind),
+            poll: health::poll,
+            description,
+        })
     }
 
-    /// Lets jobs take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where that is not
-    /// known, for what the driver grants, which it does not tell before.
+    /// Lets all jobs together take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where
+    /// that is not known, for what the driver grants, which it does not tell before.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
-        Self { memory_limit: Some(bytes), ..self }
+        Self { account: Account::new(Some(bytes)), ..self }
+    }
+
+    /// Says how long one submission, a step or a pass, may take until the device counts as lost; without it, two minutes, half an
+    /// hour with software.
+    pub fn with_patience(self, patience: Duration) -> Self {
+        Self { patience, ..self }
+    }
+
+    /// Waits in another way.
+    #[cfg(test)]
+    pub(crate) fn with_poll(self, poll: Poll) -> Self {
+        Self { poll, ..self }
     }
 
     /// Says whether stages run in their form for subgroups, where the device has any. The results are the same to the byte;
@@ -291,9 +314,9 @@ impl GpuDevice {
         self.uses_subgroups
     }
 
-    /// See [`GpuDevice::with_memory_limit`].
-    pub(crate) fn memory_limit(&self) -> Option<u64> {
-        self.memory_limit
+    /// What buffers take, see [`GpuDevice::with_memory_limit`].
+    pub(crate) fn account(&self) -> &Arc<Account> {
+        &self.account
     }
 
     /// What it is.
@@ -311,18 +334,6 @@ impl GpuDevice {
         // Kernels count words in 32 bits, and the last row of workgroups reaches some beyond the end: 65 535 blocks of 1024.
         let counted = 4 * u64::from(u32::MAX - (1 << 27));
         self.limits.max_buffer_size.min(self.limits.max_storage_buffer_binding_size).min(counted)
-    }
-
-    /// Whether the device still does what it is told.
-    pub fn check(&self) -> Result<(), EngineError> {
-        let fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner);
-        match (&fault.lost, &fault.error) {
-            (Some(lost), _) => Err(EngineError::DeviceLost(format!("{}: {lost}", self.description.name))),
-            (None, Some(error)) => {
-                Err(EngineError::DeviceLost(format!("{}: {error}", self.description.name)))
-            }
-            (None, None) => Ok(()),
-        }
     }
 }
 

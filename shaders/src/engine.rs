@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytemuck::bytes_of;
 use splat::{
     cameras::Camera,
-    engine::{Engine, EngineError, Rendering, Session, SessionInput, check_size},
+    engine::{Engine, EngineError, Rendering, Session, SessionInput, check_size, check_tracks},
     gaussians::{Gaussians, gradients::GaussianGradients},
     image::Image,
     motion::{moments::FootprintMoments, reweighting::Reweighting},
@@ -21,9 +21,9 @@ use crate::{
     layout::{GEOMETRY, State, Step, View},
     moments::{LastMeasured, footprint_moments},
     program::{Dispatch, record},
-    readback::read,
     session::GpuSession,
     stages::{Binder, ViewBuffer},
+    transfer::{read, write},
 };
 
 /// An opened device and its compiled kernels.
@@ -43,8 +43,7 @@ pub struct GpuEngine {
 impl GpuEngine {
     /// Compiles the kernels for a device.
     pub fn new(device: GpuDevice) -> Result<Self, EngineError> {
-        let kernels = Kernels::new(&device.device, device.uses_subgroups());
-        device.check()?;
+        let kernels = device.guarded(|| Ok(Kernels::new(&device.device, device.uses_subgroups())))?;
         let context = Context { device, kernels, measured: LastMeasured::default() };
         Ok(Self { context: Arc::new(context) })
     }
@@ -62,6 +61,15 @@ impl GpuEngine {
         background: [f32; 3],
     ) -> Result<Vec<u8>, EngineError> {
         check_size(camera)?;
+        self.context.device.guarded(|| self.rgb8(gaussians, camera, background))
+    }
+
+    fn rgb8(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+    ) -> Result<Vec<u8>, EngineError> {
         let Context { device, kernels, .. } = &*self.context;
         let view = ViewBuffer::new(device, View::new(camera, background))?;
         let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, false)?)?;
@@ -88,19 +96,30 @@ impl GpuEngine {
     ) -> Result<GaussianGradients, EngineError> {
         check_size(camera)?;
         check_seeds(camera, image_gradient, alpha_gradient)?;
-        let Context { device, kernels, .. } = &*self.context;
-        let view = ViewBuffer::new(device, View::new(camera, background))?;
-        let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
-        let gradients = GradientBuffers::new(device, &buffers.size)?;
         let alpha = alpha_gradient.iter().copied().chain(std::iter::repeat(0.0));
-        let pixels: Vec<f32> = image_gradient
+        let seeds: Vec<f32> = image_gradient
             .as_chunks::<3>()
             .0
             .iter()
             .zip(alpha)
             .flat_map(|([red, green, blue], alpha)| [*red, *green, *blue, alpha])
             .collect();
-        device.queue.write_buffer(&gradients.image, 0, bytemuck::cast_slice(&pixels));
+        self.context.device.guarded(|| self.gradients(gaussians, camera, background, &seeds))
+    }
+
+    /// Gradient by every parameter of the sum of `seeds`, four per pixel, times colour and alpha.
+    fn gradients(
+        &self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        seeds: &[f32],
+    ) -> Result<GaussianGradients, EngineError> {
+        let Context { device, kernels, .. } = &*self.context;
+        let view = ViewBuffer::new(device, View::new(camera, background))?;
+        let buffers = self.draw(gaussians, &view, self.buffers(gaussians, &view.data, true)?)?;
+        let gradients = GradientBuffers::new(device, &buffers.size)?;
+        write(device, &gradients.image, seeds)?;
         let mut encoder = device.device.create_command_encoder(&Default::default());
         record(&mut encoder, "gradient", &Binder { device, kernels }.backward(&buffers, &gradients, &view));
         device.queue.submit([encoder.finish()]);
@@ -189,9 +208,7 @@ impl GpuEngine {
             if state[0].failed == 0 {
                 return Ok((buffers, state[0].needed));
             }
-            let size = buffers.size.with_room(device, state[0].needed)?;
-            admit(device, &Buffers::requests(&size))?;
-            buffers.resize(device, size)?;
+            buffers.resize(device, buffers.size.with_room(device, state[0].needed)?)?;
         }
     }
 }
@@ -228,11 +245,13 @@ impl Engine for GpuEngine {
         background: [f32; 3],
     ) -> Result<Rendering, EngineError> {
         check_size(camera)?;
-        let view = ViewBuffer::new(&self.context.device, View::new(camera, background))?;
-        let buffers = self.buffers(gaussians, &view.data, false)?;
-        let buffers = self.draw(gaussians, &view, buffers)?;
-        let pixels: Vec<[f32; 4]> =
-            read(&self.context.device, &buffers.images.rendered, view.data.pixels() as usize)?;
+        let device = &self.context.device;
+        let pixels: Vec<[f32; 4]> = device.guarded(|| {
+            let view = ViewBuffer::new(device, View::new(camera, background))?;
+            let buffers = self.buffers(gaussians, &view.data, false)?;
+            let buffers = self.draw(gaussians, &view, buffers)?;
+            read(device, &buffers.images.rendered, view.data.pixels() as usize)
+        })?;
         let image = Image {
             width: camera.width,
             height: camera.height,
@@ -248,10 +267,14 @@ impl Engine for GpuEngine {
         tracks: &TrackField,
         reweighting: Option<&Reweighting>,
     ) -> Result<Vec<FootprintMoments>, EngineError> {
-        footprint_moments(self, gaussians, camera, tracks, reweighting)
+        check_size(camera)?;
+        check_tracks(camera, tracks)?;
+        self.context.device.guarded(|| footprint_moments(self, gaussians, camera, tracks, reweighting))
     }
 
     fn session(&self, input: SessionInput) -> Result<Box<dyn Session>, EngineError> {
-        Ok(Box::new(GpuSession::new(Arc::clone(&self.context), input)?))
+        input.validate()?;
+        let session = || GpuSession::new(Arc::clone(&self.context), input);
+        Ok(Box::new(self.context.device.guarded(session)?))
     }
 }

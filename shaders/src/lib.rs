@@ -22,11 +22,12 @@ mod moments;
 mod optimise;
 mod probe;
 mod program;
-mod readback;
+
 mod session;
 mod stages;
 #[cfg(test)]
 mod tests;
+mod transfer;
 mod wanted;
 
 pub use device::{

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use bytemuck::cast_slice;
 use splat::{
     cameras::Camera,
-    engine::{EngineError, check_size, check_tracks},
+    engine::EngineError,
     gaussians::Gaussians,
     motion::{
         moments::FootprintMoments,
@@ -20,8 +20,8 @@ use crate::{
     engine::{Context, GpuEngine},
     layout::{Expectation, Moments, View},
     program::record,
-    readback::read,
     stages::{Binder, ViewBuffer},
+    transfer::read,
 };
 
 /// What all passes over a view share.
@@ -32,7 +32,7 @@ struct Measurement<'a> {
     tracks: MomentBuffers,
 }
 
-/// See `Engine::footprint_moments`.
+/// See `Engine::footprint_moments`; the tracks are of the camera's size.
 pub(crate) fn footprint_moments(
     engine: &GpuEngine,
     gaussians: &Gaussians,
@@ -40,8 +40,6 @@ pub(crate) fn footprint_moments(
     tracks: &TrackField,
     reweighting: Option<&Reweighting>,
 ) -> Result<Vec<FootprintMoments>, EngineError> {
-    check_size(camera)?;
-    check_tracks(camera, tracks)?;
     let device = &engine.context.device;
     let view = ViewBuffer::new(device, View::new(camera, [0.0; 3]))?;
     let size = engine.size(gaussians.len(), 1, &view.data, false)?;
@@ -52,7 +50,7 @@ pub(crate) fn footprint_moments(
             .run(&measured.colourless, &view, buffers, |binder, buffers, view| binder.lists(buffers, view))?;
     // Sums are the largest buffer by far, and by now it is known how many there are.
     let of_lists = Size { capacity: intersections.into(), ..buffers.size };
-    admit(device, &[Buffers::requests(&buffers.size), MomentBuffers::requests(&of_lists).to_vec()].concat())?;
+    admit(device, &MomentBuffers::requests(&of_lists))?;
     let tracks = MomentBuffers::new(device, &of_lists, tracks)?;
     let measurement = Measurement { context: &engine.context, view, buffers, tracks };
     let (expectations, all) = every(gaussians.len());
@@ -83,6 +81,11 @@ pub(crate) struct Measured {
 pub(crate) struct LastMeasured(Mutex<Option<Arc<Measured>>>);
 
 impl LastMeasured {
+    /// Frees what is kept, unless it is in use.
+    pub(crate) fn forget(&self) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+
     /// Uploads a set unless it is there already.
     pub(crate) fn take_over(
         &self,
@@ -153,7 +156,7 @@ impl Measurement<'_> {
         wanted: &[u32],
     ) -> Result<Vec<FootprintMoments>, EngineError> {
         let Self { context: Context { device, kernels, .. }, view, buffers, tracks } = self;
-        tracks.ask(device, expectations, wanted);
+        tracks.ask(device, expectations, wanted)?;
         let mut encoder = device.device.create_command_encoder(&Default::default());
         // Tiles whose pixels are covered leave the rest of their list alone.
         encoder.clear_buffer(&tracks.sums, 0, None);

@@ -2,10 +2,9 @@
 
 use bytemuck::bytes_of;
 use splat::engine::EngineError;
-use wgpu::Buffer;
 
 use crate::{
-    buffers::{Buffers, GradientBuffers, LossBuffers, OptimiserBuffers, allocate, uniform},
+    buffers::{Buffer, Buffers, GradientBuffers, LossBuffers, OptimiserBuffers, allocate, uniform},
     kernels::Kernel,
     layout::{GEOMETRY, ReplaceSettings},
     program::{Dispatch, Groups},

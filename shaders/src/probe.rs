@@ -17,9 +17,9 @@ use crate::{
     layout::State,
     moments::every,
     program::{Dispatch, record_timed},
-    readback::read,
     session::GpuSession,
     stages::Binder,
+    transfer::read,
 };
 
 /// Repeats in one submission: a set of queries is short.
@@ -88,7 +88,7 @@ impl Probe {
         let (buffers, view) = session.first_view();
         let of_tracks = MomentBuffers::new(device, &buffers.size, tracks)?;
         let (expectations, all) = every(count);
-        of_tracks.ask(device, &expectations, &all);
+        of_tracks.ask(device, &expectations, &all)?;
         let moments = binder.footprint_moments(buffers, &of_tracks, view, count as u64);
         let [forward, loss, backward, optimiser] = session.stages(&binder, 0);
         let programs = [forward, loss, backward, optimiser, moments.into()];

@@ -1,8 +1,8 @@
 //! A fixed list of dispatches, recorded again for every step.
 
-use wgpu::{BindGroup, Buffer, CommandEncoder, ComputePassDescriptor, ComputePassTimestampWrites};
+use wgpu::{BindGroup, CommandEncoder, ComputePassDescriptor, ComputePassTimestampWrites};
 
-use crate::kernels::Kernel;
+use crate::{buffers::Buffer, kernels::Kernel};
 
 /// How many workgroups a dispatch has.
 #[derive(Clone, Debug)]
@@ -16,9 +16,13 @@ pub(crate) enum Groups {
 impl Groups {
     /// `count` workgroups, laid out in rows as `group_number` in the shaders expects; at least one.
     pub(crate) fn of(count: u64) -> Self {
-        const ROW: u64 = 65_535;
-        let count = count.max(1);
-        Self::Fixed(count.min(ROW) as u32, count.div_ceil(ROW) as u32)
+        Self::in_rows(count, 65_535)
+    }
+
+    /// The same in rows of at most `row`.
+    pub(crate) fn in_rows(count: u64, row: u32) -> Self {
+        let (count, row) = (count.max(1), u64::from(row));
+        Self::Fixed(count.min(row) as u32, count.div_ceil(row) as u32)
     }
 
     /// Workgroups of 256 threads for so many items.

@@ -12,19 +12,20 @@ use splat::{
     gaussians::Gaussians,
     optim::LearningRates,
 };
-use wgpu::Buffer;
+use wgpu::SubmissionIndex;
 
 use crate::{
     buffers::{
-        Buffers, FootprintBuffers, GradientBuffers, LossBuffers, OptimiserBuffers, ParameterBuffers, Request,
-        Size, admit, allocate, first_capacity, separated, storage, training_image, training_requests,
+        Buffer, Buffers, FootprintBuffers, GradientBuffers, LossBuffers, OptimiserBuffers, ParameterBuffers,
+        Request, Size, admit, admit_instead, allocate, first_capacity, parameters::check_lengths, separated,
+        storage, total, training_image, training_requests,
     },
     device::GpuDevice,
     engine::Context,
     layout::{Density, GEOMETRY, State, Step, View},
     program::{Dispatch, record},
-    readback::read,
     stages::{Binder, ViewBuffer},
+    transfer::{read, write},
     wanted::{WantedImage, is_eight_bits},
 };
 
@@ -44,12 +45,14 @@ pub(crate) struct SessionView {
 }
 
 /// A submitted step whose outcome has not been looked at.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Submitted {
     view: usize,
     rates: LearningRates,
     /// Number of the step in the optimiser's count, from 1.
     number: u64,
+    /// What to wait for.
+    submission: SubmissionIndex,
 }
 
 /// See [`Session`].
@@ -67,12 +70,16 @@ pub(crate) struct GpuSession {
     steps: u64,
     submitted: Vec<Submitted>,
     losses: Vec<f32>,
+    /// What left the session without a whole state.
+    failure: Option<EngineError>,
 }
 
 impl GpuSession {
+    /// `input` is valid.
     pub(crate) fn new(context: Arc<Context>, input: SessionInput) -> Result<Self, EngineError> {
-        input.validate()?;
         let device = &context.device;
+        // Whoever optimises a set has measured it.
+        context.measured.forget();
         let gaussians = &input.gaussians;
         let images = || input.views.iter().map(|view| View::new(&view.camera, input.background));
         let (count, tiles) = (gaussians.len() as u64, images().map(|view| view.tile_count()).max());
@@ -103,6 +110,7 @@ impl GpuSession {
             steps: 0,
             submitted: Vec::new(),
             losses: Vec::new(),
+            failure: None,
             context,
         };
         session.bind();
@@ -150,11 +158,10 @@ impl GpuSession {
         device.queue.write_buffer(&self.buffers.common.state, 0, bytes_of(&state));
     }
 
-    /// Submits a step whose loss goes to `place`.
-    fn submit(&self, step: &Submitted, place: usize) {
+    /// Submits step `number` on a view; its loss goes to `place`.
+    fn submit(&self, view: usize, rates: &LearningRates, number: u64, place: usize) -> SubmissionIndex {
         let Context { device, .. } = &*self.context;
-        let rates = &step.rates;
-        let decay = |beta: f64| 1.0 - beta.powf(step.number as f64);
+        let decay = |beta: f64| 1.0 - beta.powf(number as f64);
         let data = Step {
             count: self.count as u32,
             coefficients: self.coefficients() as u32,
@@ -171,23 +178,63 @@ impl GpuSession {
         };
         device.queue.write_buffer(&self.buffers.common.step, 0, bytes_of(&data));
         let mut encoder = device.device.create_command_encoder(&Default::default());
-        record(&mut encoder, "step", &self.views[step.view].program);
-        device.queue.submit([encoder.finish()]);
+        record(&mut encoder, "step", &self.views[view].program);
+        device.queue.submit([encoder.finish()])
+    }
+
+    /// Does something unless the session is broken. It is broken by what ends in the middle of a change, and by work that the
+    /// device did not take.
+    fn guarded<T>(
+        &mut self,
+        operation: impl FnOnce(&mut Self) -> Result<T, EngineError>,
+    ) -> Result<T, EngineError> {
+        if let Some(failure) = &self.failure {
+            return Err(failure.clone());
+        }
+        let context = Arc::clone(&self.context);
+        let outcome = context.device.guarded(|| operation(self));
+        if let Err(failure @ EngineError::Internal(_)) = &outcome {
+            self.failure = Some(failure.clone());
+        }
+        outcome
+    }
+
+    /// Waits for one step after the other: how long one may take is known, how long all of them may is not.
+    fn wait(&self) -> Result<(), EngineError> {
+        let device = &self.context.device;
+        self.submitted.iter().try_for_each(|step| device.wait(Some(step.submission.clone())))
+    }
+
+    /// Makes every later step one that the device refuses.
+    #[cfg(test)]
+    pub(crate) fn break_buffers(&self) {
+        self.buffers.footprints.footprints.destroy();
+    }
+
+    /// Unbinds everything, so that a buffer that is dropped is freed.
+    fn unbind(&mut self) {
+        self.views.iter_mut().for_each(|view| view.program.clear());
     }
 
     /// Looks at the outcome of all submitted steps, and repeats those for which there was no room.
     fn settle(&mut self) -> Result<(), EngineError> {
         while !self.submitted.is_empty() {
+            self.wait()?;
             let context = Arc::clone(&self.context);
             let state: Vec<State> = read(&context.device, &self.buffers.common.state, 1)?;
             let State { failed, failed_step, needed, .. } = state[0];
             let done = if failed == 0 { self.submitted.len() } else { failed_step as usize };
             let losses: Vec<f32> = read(&context.device, &self.loss.losses, done)?;
             if failed != 0 {
-                // Before anything changes here: where there is no room, asking again must find what it found now.
+                // Where there is no room, nothing changes here: asking again must find what it found now.
                 let size = self.buffers.size.with_room(&context.device, needed)?;
-                admit(&context.device, &self.requests(&size, self.active.len()))?;
-                self.buffers.resize(&context.device, size)?;
+                let [old, new] =
+                    [&self.buffers.size, &size].map(|size| self.requests(size, self.active.len()));
+                admit_instead(&context.device, &new, total(&old))?;
+                self.unbind();
+                self.buffers
+                    .resize(&context.device, size)
+                    .inspect_err(|error| self.failure = Some(error.clone()))?;
             }
             self.losses.extend(losses);
             self.submitted.drain(..done);
@@ -195,40 +242,62 @@ impl GpuSession {
                 break;
             }
             self.bind();
-            for (place, step) in self.submitted.iter().enumerate() {
-                self.submit(step, place);
+            for place in 0..self.submitted.len() {
+                let Submitted { view, rates, number, .. } = self.submitted[place].clone();
+                self.submitted[place].submission = self.submit(view, &rates, number, place);
             }
         }
         Ok(())
     }
 
-    /// Moments of a set that takes those of the Gaussians in `source` over.
-    fn moments_of(
-        &self,
-        source: &[Option<usize>],
-        active: &[bool],
-        size: &Size,
-    ) -> Result<OptimiserBuffers, EngineError> {
-        let Context { device, kernels, .. } = &*self.context;
-        let count = size.count;
-        let taken = OptimiserBuffers::new(device, size, active)?;
-        let [sources] = allocate(device, [storage("sources", 4 * count)])?;
+    /// Gives the optimiser the moments of a set that takes those of the Gaussians in `source` over, one array after the other, so that
+    /// there is one of them twice at most.
+    fn take_moments_over(&mut self, source: &[Option<usize>], size: &Size) -> Result<(), EngineError> {
+        let context = Arc::clone(&self.context);
+        let Context { device, kernels, .. } = &*context;
+        let taken = OptimiserBuffers::new(device, &Size { count: 0, ..*size }, &self.active)?;
+        let [sources] = allocate(device, [storage("sources", 4 * size.count)])?;
         let numbers: Vec<u32> = source.iter().map(|old| old.map_or(u32::MAX, |old| old as u32)).collect();
-        device.queue.write_buffer(&sources, 0, bytemuck::cast_slice(&numbers));
+        write(device, &sources, &numbers)?;
         let binder = Binder { device, kernels };
         let widths = [GEOMETRY, GEOMETRY, 3 * self.coefficients(), 3 * self.coefficients()];
-        let dispatches = self
-            .optimiser
-            .moments
-            .iter()
-            .zip(&taken.moments)
-            .zip(widths)
-            .map(|((old, new), width)| binder.replace(&sources, old, new, count, width as u64))
-            .collect::<Result<Vec<_>, _>>()?;
-        let mut encoder = device.device.create_command_encoder(&Default::default());
-        record(&mut encoder, "replace", &dispatches);
-        device.queue.submit([encoder.finish()]);
-        Ok(taken)
+        for (moments, width) in self.optimiser.moments.iter_mut().zip(widths) {
+            let [new] = allocate(device, [storage("moments", 4 * width as u64 * size.count)])?;
+            let dispatch = binder.replace(&sources, moments, &new, size.count, width as u64)?;
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            record(&mut encoder, "replace", [&dispatch]);
+            let submission = device.queue.submit([encoder.finish()]);
+            device.wait(Some(submission))?;
+            *moments = new;
+        }
+        self.optimiser.active = taken.active;
+        Ok(())
+    }
+
+    /// Has the buffers of another set instead of those of this one, which are freed first.
+    fn change(
+        &mut self,
+        gaussians: &Gaussians,
+        source: &[Option<usize>],
+        active: Vec<bool>,
+    ) -> Result<(), EngineError> {
+        let context = Arc::clone(&self.context);
+        let device = &context.device;
+        let none = Size { count: 0, ..self.buffers.size };
+        let size = Size { count: gaussians.len() as u64, ..self.buffers.size };
+        self.unbind();
+        self.buffers.parameters = ParameterBuffers::new(device, &Gaussians::empty(self.sh_degree))?;
+        self.buffers.footprints = FootprintBuffers::new(device, 0)?;
+        self.gradients = GradientBuffers::new(device, &none)?;
+        self.active = active;
+        self.take_moments_over(source, &size)?;
+        self.buffers.parameters = ParameterBuffers::new(device, gaussians)?;
+        self.buffers.footprints = FootprintBuffers::new(device, size.count)?;
+        self.gradients = GradientBuffers::new(device, &size)?;
+        self.buffers.size = size;
+        self.count = gaussians.len();
+        self.bind();
+        Ok(())
     }
 }
 
@@ -248,7 +317,7 @@ pub(crate) fn session_view(
     }
     view.is_packed = wanted.is_packed.into();
     let [buffer] = allocate(device, [training_image(view.pixels(), wanted.is_packed)])?;
-    device.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&wanted.words));
+    write(device, &buffer, &wanted.words)?;
     Ok(SessionView { view: ViewBuffer::new(device, view)?, wanted: buffer, program: Vec::new() })
 }
 
@@ -257,64 +326,81 @@ impl Session for GpuSession {
         if view >= self.views.len() {
             return Err(EngineError::InvalidInput(format!("view {view} of {}", self.views.len())));
         }
-        if self.submitted.len() == REMEMBERED {
-            self.settle()?;
-        }
-        self.steps += 1;
-        let step = Submitted { view, rates: *rates, number: self.steps };
-        self.submit(&step, self.submitted.len());
-        self.submitted.push(step);
-        Ok(())
+        self.guarded(|session| {
+            if session.submitted.len() == REMEMBERED {
+                session.settle()?;
+            }
+            session.steps += 1;
+            let number = session.steps;
+            let submission = session.submit(view, rates, number, session.submitted.len());
+            session.submitted.push(Submitted { view, rates: *rates, number, submission });
+            Ok(())
+        })
     }
 
     fn take_losses(&mut self) -> Result<Vec<f32>, EngineError> {
-        self.settle()?;
+        self.guarded(Self::settle)?;
         Ok(std::mem::take(&mut self.losses))
     }
 
     fn gaussians(&mut self) -> Result<Gaussians, EngineError> {
-        self.settle()?;
-        let device = &self.context.device;
-        let geometry: Vec<[f32; GEOMETRY]> = read(device, &self.buffers.parameters.geometry, self.count)?;
-        let sh = read(device, &self.buffers.parameters.sh, 3 * self.coefficients() * self.count)?;
-        Ok(separated(&geometry, sh, self.sh_degree))
+        self.guarded(|session| {
+            session.settle()?;
+            let (device, parameters) = (&session.context.device, &session.buffers.parameters);
+            let geometry: Vec<[f32; GEOMETRY]> = read(device, &parameters.geometry, session.count)?;
+            let sh = read(device, &parameters.sh, 3 * session.coefficients() * session.count)?;
+            Ok(separated(&geometry, sh, session.sh_degree))
+        })
     }
 
     fn take_density_statistics(&mut self) -> Result<DensityStatistics, EngineError> {
-        self.settle()?;
-        let device = &self.context.device;
-        let density: Vec<Density> = read(device, &self.gradients.density, self.count)?;
-        let mut encoder = device.device.create_command_encoder(&Default::default());
-        encoder.clear_buffer(&self.gradients.density, 0, None);
-        device.queue.submit([encoder.finish()]);
-        Ok(DensityStatistics {
-            gradient_norm: density.iter().map(|density| density.gradient_norm).collect(),
-            visible_steps: density.iter().map(|density| density.visible_steps).collect(),
+        self.guarded(|session| {
+            session.settle()?;
+            let device = &session.context.device;
+            let density: Vec<Density> = read(device, &session.gradients.density, session.count)?;
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            encoder.clear_buffer(&session.gradients.density, 0, None);
+            device.queue.submit([encoder.finish()]);
+            Ok(DensityStatistics {
+                gradient_norm: density.iter().map(|density| density.gradient_norm).collect(),
+                visible_steps: density.iter().map(|density| density.visible_steps).collect(),
+            })
         })
     }
 
     fn replace(&mut self, gaussians: Gaussians, source: &[Option<usize>]) -> Result<(), EngineError> {
         check_replacement(&gaussians, source, self.count, self.sh_degree)?;
-        self.settle()?;
+        check_lengths(&gaussians)?;
         let active: Vec<bool> = if self.active.is_empty() {
             Vec::new()
         } else {
             source.iter().map(|old| old.is_none_or(|old| self.active[old])).collect()
         };
-        let context = Arc::clone(&self.context);
-        let device = &context.device;
-        let size = Size { count: gaussians.len() as u64, ..self.buffers.size };
-        admit(device, &self.requests(&size, active.len()))?;
-        let optimiser = self.moments_of(source, &active, &size)?;
-        self.buffers.parameters = ParameterBuffers::new(device, &gaussians)?;
-        self.buffers.footprints = FootprintBuffers::new(device, size.count)?;
-        self.buffers.size = size;
-        self.gradients = GradientBuffers::new(device, &size)?;
-        self.optimiser = optimiser;
-        self.active = active;
-        self.count = gaussians.len();
-        self.bind();
-        Ok(())
+        self.guarded(|session| {
+            session.settle()?;
+            // As long as nothing has changed.
+            let old = session.requests(&session.buffers.size, session.active.len());
+            let size = Size { count: gaussians.len() as u64, ..session.buffers.size };
+            let mut new = session.requests(&size, active.len());
+            new.push(twice(&size));
+            admit_instead(&session.context.device, &new, total(&old))?;
+            session
+                .change(&gaussians, source, active)
+                .inspect_err(|error| session.failure = Some(error.clone()))
+        })
+    }
+}
+
+/// What a change of the set takes beyond the set: the largest array of moments is there twice, and where they come from.
+fn twice(size: &Size) -> Request {
+    let width = (GEOMETRY as u64).max(3 * size.coefficients);
+    storage("moments", 4 * (width + 1) * size.count)
+}
+
+impl Drop for GpuSession {
+    fn drop(&mut self) {
+        // Buffers that a device is at work on are not freed with their last owner. A device that is lost has nothing to free.
+        let _ = self.wait().and_then(|()| self.context.device.wait(None));
     }
 }
 

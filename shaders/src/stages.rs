@@ -2,11 +2,11 @@
 
 use bytemuck::bytes_of;
 use splat::engine::EngineError;
-use wgpu::{BindingResource, Buffer};
+use wgpu::BindingResource;
 
 use crate::{
     buffers::{
-        BLOCK, Buffers, CommonBuffers, DEPTH_PASSES, DIGITS, GradientBuffers, IntersectionBuffers,
+        BLOCK, Buffer, Buffers, CommonBuffers, DEPTH_PASSES, DIGITS, GradientBuffers, IntersectionBuffers,
         MomentBuffers, SortBuffers, allocate, uniform,
     },
     device::GpuDevice,
@@ -153,16 +153,7 @@ impl Binder<'_> {
         ));
         let scans = Groups::of((footprints.count + 1).div_ceil(BLOCK));
         self.scan(common, 0, &footprints.counts, &footprints.sums, &scans, program);
-        program.push(self.dispatch(
-            &self.kernels.plan,
-            Groups::of(1),
-            &[
-                (1, whole(&common.step)),
-                (11, whole(&footprints.counts)),
-                (12, whole(&common.state)),
-                (13, whole(&common.dispatches)),
-            ],
-        ));
+        program.push(self.plan(common, &footprints.counts));
         let tiles = &intersections.tiles;
         program.push(self.dispatch(
             &self.kernels.emit,
@@ -193,6 +184,17 @@ impl Binder<'_> {
                 (15, whole(&images.bounds)),
             ],
         ));
+    }
+
+    /// Decides how many workgroups the intersections take, whose number is the last of the scanned `counts`.
+    pub(crate) fn plan(&self, common: &CommonBuffers, counts: &Buffer) -> Dispatch {
+        let resources = [
+            (1, whole(&common.step)),
+            (11, whole(counts)),
+            (12, whole(&common.state)),
+            (13, whole(&common.dispatches)),
+        ];
+        self.dispatch(&self.kernels.plan, Groups::of(1), &resources)
     }
 
     /// Sorts by the lowest `8 · passes` bits and says where the result is.

@@ -17,24 +17,35 @@ use crate::{
 };
 
 /// Why a device could not do what it was asked.
-#[derive(Debug, Error)]
+#[derive(Clone, Debug, Error)]
 pub enum EngineError {
     /// The input breaks a documented precondition.
     #[error("invalid input to the engine: {0}")]
     InvalidInput(String),
     /// The device has not enough memory for the job.
     #[error(
-        "the job needs {needed} bytes on the device, {available} are available; use fewer Gaussians, smaller images or another worker"
+        "the job needs {needed} bytes on the device, {}; use fewer Gaussians, smaller images or another worker",
+        granted(*available)
     )]
     OutOfResources {
         /// Bytes the job would take.
         needed: u64,
-        /// Bytes the device grants.
+        /// Bytes the device grants; 0 where the driver refused without saying.
         available: u64,
     },
     /// The device went away.
     #[error("the device was lost: {0}")]
     DeviceLost(String),
+    /// The engine asked its device for what the device's rules forbid. The device works on.
+    #[error("the engine broke a rule of its device: {0}; this is a bug, please report it")]
+    Internal(String),
+}
+
+fn granted(available: u64) -> String {
+    match available {
+        0 => "its driver grants no more".to_owned(),
+        bytes => format!("{bytes} are available"),
+    }
 }
 
 /// A rendered view.

@@ -33,9 +33,8 @@ fn of_pixel(rendering: &Rendering, place: usize, pixel: &Pixel) -> [(f64, f64); 
 }
 
 /// Every pixel against the decision that suits it best: one nearer to its threshold than its rounding may fall either way.
-fn of_scene(scene: &Scene, references: &[Vec<Pixel>; 3], instructions: Instructions) -> Vec<(f64, f64)> {
-    let rendering =
-        CpuEngine::new(instructions).render(&scene.gaussians, &scene.camera, scene.background).unwrap();
+fn of_scene(scene: &Scene, references: &[Vec<Pixel>; 3], engine: &dyn Engine) -> Vec<(f64, f64)> {
+    let rendering = engine.render(&scene.gaussians, &scene.camera, scene.background).unwrap();
     let best = |place: usize| {
         let tries = references.each_ref().map(|reference| of_pixel(&rendering, place, &reference[place]));
         tries.into_iter().min_by(|a, b| excess(a).total_cmp(&excess(b))).unwrap()
@@ -45,21 +44,29 @@ fn of_scene(scene: &Scene, references: &[Vec<Pixel>; 3], instructions: Instructi
     pixels.map(|(error, predicted)| (error / brightest, predicted / brightest)).collect()
 }
 
-fn row(extreme: &Extreme) -> Row {
-    let mut row = Row::new("project, bin, blend", extreme.name, BAR);
+/// One row on these engines; it is held to so many times the bound of the processor's.
+pub(crate) fn row(extreme: &Extreme, engines: &[&dyn Engine], factor: f64) -> Row {
+    let bar = Bar { factor: factor * BAR.factor, ..BAR };
+    let mut row = Row::new("project, bin, blend", extreme.name, bar);
     for scene in &extreme.scenes {
         let references =
             Close::ALL.map(|close| render(&scene.gaussians, &scene.camera, scene.background, close));
-        for instructions in Instructions::available() {
-            row.case_of(of_scene(scene, &references, instructions));
+        for engine in engines {
+            row.case_of(of_scene(scene, &references, *engine));
         }
     }
     row
 }
 
+/// What is swept.
+pub(crate) fn sweeps() -> Vec<Extreme> {
+    let pile = pile("100 000 Gaussians on one pixel, opacity 0.0039 to 1", 100_000, 5);
+    [typical()].into_iter().chain(extremes()).chain([pile]).collect()
+}
+
 /// Every row of this sweep.
 pub(crate) fn rows() -> Vec<Row> {
-    let pile = pile("100 000 Gaussians on one pixel, opacity 0.0039 to 1", 100_000, 5);
-    let all = [typical()].into_iter().chain(extremes()).chain([pile]);
-    all.map(|extreme| row(&extreme)).collect()
+    let engines: Vec<CpuEngine> = Instructions::available().map(CpuEngine::new).collect();
+    let engines: Vec<&dyn Engine> = engines.iter().map(|engine| engine as &dyn Engine).collect();
+    sweeps().iter().map(|extreme| row(extreme, &engines, 1.0)).collect()
 }

@@ -185,6 +185,7 @@ fn failure_of(error: FrameError) -> JobError {
         FrameError::BadInput(_) | FrameError::Engine(EngineError::InvalidInput(_)) => FailureKind::BadInput,
         FrameError::Engine(EngineError::OutOfResources { .. }) => FailureKind::OutOfResources,
         FrameError::Engine(EngineError::DeviceLost(_)) | FrameError::Cancelled => FailureKind::Transient,
+        FrameError::Engine(EngineError::Internal(_)) => FailureKind::Bug,
     };
     JobError::new(kind, error.to_string())
 }
@@ -243,6 +244,7 @@ mod tests {
         let memory = EngineError::OutOfResources { needed: 2, available: 1 };
         assert_eq!(kind(memory.into()), FailureKind::OutOfResources);
         assert_eq!(kind(EngineError::DeviceLost("x".into()).into()), FailureKind::Transient);
+        assert_eq!(kind(EngineError::Internal("x".into()).into()), FailureKind::Bug);
     }
 
     #[test]

@@ -235,7 +235,13 @@ impl Worker {
                     coordinator_message::Message::CancelLease(cancel) => self.cancel(&cancel.lease_id, &cancel.reason),
                     coordinator_message::Message::Receipt(receipt) => {
                         if self.acknowledge(&receipt.lease_id, receipt.accepted, &receipt.reason) {
-                            if let Err(reason) = self.look_at_device().await {
+                            let looked = tokio::select! {
+                                biased;
+                                // To open a device may take long, and nobody needs it any more.
+                                () = shutdown.cancelled() => return Ok(self.stop(Some(connection)).await),
+                                looked = self.look_at_device() => looked,
+                            };
+                            if let Err(reason) = looked {
                                 let goodbye = GoingAway { reason: reason.clone() };
                                 // A stream that breaks right now brings no device back.
                                 let _ = connection.send(worker_message::Message::GoingAway(goodbye));

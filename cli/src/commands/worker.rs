@@ -47,7 +47,10 @@ pub(super) async fn run(args: WorkerArgs) -> Result<(), CliError> {
         reconnect_for: args.reconnect_for,
         remote_blobs: args.remote_blobs,
     };
-    match trackersplat_worker::run(options, args.engine.engine()?, interrupt::token()?).await {
+    let engine = args.engine.engine()?;
+    // A worker without its device is of no use, and the coordinator is told which one it is.
+    engine.check().map_err(|error| CliError::failed("the worker's device", error))?;
+    match trackersplat_worker::run(options, engine, interrupt::token()?).await {
         Ok(Exit::Dismissed | Exit::ShutDown) => Ok(()),
         Err(
             error @ (WorkerError::BadAddress(_)

@@ -7,7 +7,7 @@ use std::{fmt, str::FromStr, sync::Arc};
 use splat::engine::{Engine, EngineError};
 use splat_shaders::{DeviceChoice, DeviceError, GpuDevice, GpuEngine, choose, devices, real_gpus};
 
-use self::reopening::ReopeningEngine;
+use self::reopening::{Candidate, ReopeningEngine};
 use crate::error::CliError;
 
 /// `--device` on the command line.
@@ -37,19 +37,14 @@ impl FromStr for DeviceArg {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let lower = text.trim().to_lowercase();
-        match (lower.as_str(), lower.strip_prefix("gpu:")) {
-            ("", _) => Err("a device has a name; `trackersplat devices` lists them".to_owned()),
-            ("auto", _) => Ok(Self::Auto),
-            ("cpu", _) => Ok(Self::Cpu),
-            ("gpu", _) => Ok(Self::Gpu),
-            (_, Some(number)) => match number.parse() {
-                Ok(number) => Ok(Self::One(DeviceChoice::Index(number))),
-                Err(_) => Err(format!(
-                    "'{number}' is no number of a GPU; `trackersplat devices` lists them, as gpu:0 and so on"
-                )),
+        match text.trim().to_lowercase().as_str() {
+            "auto" => Ok(Self::Auto),
+            "cpu" => Ok(Self::Cpu),
+            "gpu" => Ok(Self::Gpu),
+            _ => match text.parse() {
+                Ok(choice) => Ok(Self::One(choice)),
+                Err(error) => Err(format!("{error}; `trackersplat devices` lists them")),
             },
-            _ => Ok(Self::One(DeviceChoice::Name(text.trim().to_owned()))),
         }
     }
 }
@@ -95,20 +90,34 @@ impl DeviceArg {
     }
 }
 
-/// An engine on a GPU that opens its device, and no other, again after it was lost.
-pub(crate) fn gpu_engine(index: usize) -> Result<Arc<dyn Engine>, CliError> {
-    let failed = |why: String| {
-        CliError::failed(format!("device gpu:{index}"), format!("{why}; --device cpu does without it"))
+/// An engine on the first of these GPUs that opens, by their numbers, best first, at least one. It is opened when it is needed, and it and no other
+/// again after it was lost. `memory` is the most bytes that it takes, all there are if `None`.
+pub(crate) fn gpu_engine(gpus: &[usize], memory: Option<u64>) -> Result<Arc<dyn Engine>, CliError> {
+    let all = devices();
+    let candidate = |&index: &usize| {
+        let device = choose(&DeviceChoice::Index(index), &all)
+            .map_err(|error| CliError::failed(format!("device gpu:{index}"), error))?;
+        let itself = device.itself();
+        let open = move || open(&itself, memory);
+        Ok(Candidate { name: device.label(), open: Box::new(open) })
     };
-    let device = choose(&DeviceChoice::Index(index), &devices())
-        .map(|device| device.itself())
-        .map_err(|error| failed(error.to_string()))?;
-    let open = move || -> Result<Arc<dyn Engine>, EngineError> {
-        let device = GpuDevice::open(&device).map_err(|error| EngineError::DeviceLost(error.to_string()))?;
-        Ok(Arc::new(GpuEngine::new(device)?))
+    let candidates = gpus.iter().map(candidate).collect::<Result<Vec<_>, CliError>>()?;
+    Ok(Arc::new(ReopeningEngine::new(candidates)))
+}
+
+fn open(choice: &DeviceChoice, memory: Option<u64>) -> Result<Arc<dyn Engine>, EngineError> {
+    let device = GpuDevice::open(choice).map_err(|error| EngineError::DeviceLost(error.to_string()))?;
+    let device = match memory {
+        Some(bytes) => device.with_memory_limit(bytes),
+        None => device,
     };
-    let engine = ReopeningEngine::new(Box::new(open)).map_err(|error| failed(error.to_string()))?;
-    Ok(Arc::new(engine))
+    Ok(Arc::new(GpuEngine::new(device)?))
+}
+
+/// What each of so many processes may take of a GPU's memory, MiB; `None` where nobody knows how much there is.
+pub(crate) fn share_of_memory(gpu: usize, processes: usize) -> Option<u64> {
+    let bytes = devices().get(gpu)?.memory?;
+    Some((bytes / processes.max(1) as u64) >> 20)
 }
 
 #[cfg(test)]

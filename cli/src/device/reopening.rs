@@ -1,6 +1,6 @@
 //! An engine that outlives its device.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use splat::{
     cameras::Camera,
@@ -13,53 +13,78 @@ use splat::{
 /// Opens a device.
 pub(super) type Open = Box<dyn Fn() -> Result<Arc<dyn Engine>, EngineError> + Send + Sync>;
 
-/// An engine whose device is opened again when it is needed after it was lost. What was on it is lost: sessions of before
-/// fail, and whoever had them begins again.
+/// A device that may be taken.
+pub(super) struct Candidate {
+    /// What [`Engine::device_name`] says of it.
+    pub(super) name: String,
+    pub(super) open: Open,
+}
+
+/// An engine that opens its device when it is first needed, so that nobody waits for a device to hear that his input is wrong; the
+/// first of its candidates that opens. That one is opened again when it is needed after it was lost. What was on
+/// it is lost: sessions of before fail, and whoever had them begins again.
 pub(super) struct ReopeningEngine {
-    open: Open,
-    name: String,
-    device: Option<String>,
-    /// `None` while the device cannot be opened.
+    /// The best first.
+    candidates: Vec<Candidate>,
+    /// Which of them was opened.
+    chosen: OnceLock<usize>,
+    /// `None` before a device is opened, and while it cannot be.
     current: Mutex<Option<Arc<dyn Engine>>>,
 }
 
 impl ReopeningEngine {
-    pub(super) fn new(open: Open) -> Result<Self, EngineError> {
-        let engine = open()?;
-        Ok(Self {
-            name: engine.name().to_owned(),
-            device: engine.device_name().map(str::to_owned),
-            current: Mutex::new(Some(engine)),
-            open,
-        })
+    pub(super) fn new(candidates: Vec<Candidate>) -> Self {
+        Self { candidates, chosen: OnceLock::new(), current: Mutex::new(None) }
     }
 
     fn current(&self) -> Result<Arc<dyn Engine>, EngineError> {
         let mut current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
-        let lost = match &*current {
-            Some(engine) => match engine.check() {
+        let lost = match (&*current, self.chosen.get()) {
+            (Some(engine), _) => match engine.check() {
                 Ok(()) => return Ok(engine.clone()),
                 Err(error) => error.to_string(),
             },
-            None => "it was lost before".to_owned(),
+            (None, Some(_)) => "it was lost before".to_owned(),
+            (None, None) => return self.open_first(&mut current),
         };
         // Its memory is free before the device is asked for the same again.
         *current = None;
-        tracing::warn!(device = self.device, lost, "opening the device again");
-        let engine = (self.open)()
-            .map_err(|error| EngineError::DeviceLost(format!("{lost}; opening it again: {error}")))?;
-        *current = Some(engine.clone());
-        Ok(engine)
+        tracing::warn!(device = self.device_name(), lost, "opening the device again");
+        self.open_first(&mut current)
+            .map_err(|error| EngineError::DeviceLost(format!("{lost}; opening it again: {error}")))
+    }
+
+    /// Opens the chosen device, or chooses the first that opens.
+    fn open_first(&self, current: &mut Option<Arc<dyn Engine>>) -> Result<Arc<dyn Engine>, EngineError> {
+        let mut refusals = Vec::new();
+        for (number, candidate) in self.candidates.iter().enumerate() {
+            if self.chosen.get().is_some_and(|&chosen| chosen != number) {
+                continue;
+            }
+            match (candidate.open)() {
+                Ok(engine) => {
+                    self.chosen.get_or_init(|| number);
+                    return Ok(current.insert(engine).clone());
+                }
+                Err(error) => {
+                    tracing::warn!(device = candidate.name, %error, "the device does not open");
+                    refusals.push(error.to_string());
+                }
+            }
+        }
+        let refusals = refusals.join("; ");
+        Err(EngineError::DeviceLost(format!("{refusals}; --device cpu does without a GPU")))
     }
 }
 
 impl Engine for ReopeningEngine {
     fn name(&self) -> &str {
-        &self.name
+        "gpu"
     }
 
     fn device_name(&self) -> Option<&str> {
-        self.device.as_deref()
+        let taken = self.chosen.get().copied().unwrap_or_default();
+        self.candidates.get(taken).map(|candidate| candidate.name.as_str())
     }
 
     fn check(&self) -> Result<(), EngineError> {
@@ -159,16 +184,21 @@ mod tests {
         }
     }
 
-    fn open(bus: &Arc<Bus>) -> Open {
+    fn on(bus: &Arc<Bus>) -> Candidate {
+        named("Card A", bus)
+    }
+
+    fn named(name: &str, bus: &Arc<Bus>) -> Candidate {
         let bus = bus.clone();
-        Box::new(move || {
+        let open: Open = Box::new(move || {
             if bus.is_dead.load(SeqCst) {
                 return Err(EngineError::DeviceLost("no driver".into()));
             }
             bus.is_lost.store(false, SeqCst);
             bus.opened.fetch_add(1, SeqCst);
             Ok(Arc::new(Card { bus: bus.clone() }))
-        })
+        });
+        Candidate { name: name.to_owned(), open }
     }
 
     fn camera() -> Camera {
@@ -179,7 +209,8 @@ mod tests {
     #[test]
     fn a_lost_device_is_opened_again_once_and_only_then() {
         let bus = Arc::new(Bus::default());
-        let engine = ReopeningEngine::new(open(&bus)).unwrap();
+        let engine = ReopeningEngine::new(vec![on(&bus)]);
+        assert_eq!(bus.opened.load(SeqCst), 0, "nobody has asked for anything");
         assert_eq!((engine.name(), engine.device_name()), ("gpu", Some("Card A")));
         let render = || engine.render(&Gaussians::empty(0), &camera(), [0.5; 3]);
         for (is_lost, opened) in [(false, 1), (false, 1), (true, 2), (false, 2)] {
@@ -192,7 +223,8 @@ mod tests {
     #[test]
     fn a_device_that_stays_away_is_lost_with_both_reasons_until_it_is_back() {
         let bus = Arc::new(Bus::default());
-        let engine = ReopeningEngine::new(open(&bus)).unwrap();
+        let engine = ReopeningEngine::new(vec![on(&bus)]);
+        engine.check().unwrap();
         bus.is_lost.store(true, SeqCst);
         bus.is_dead.store(true, SeqCst);
         let error = engine.check().unwrap_err();
@@ -204,5 +236,26 @@ mod tests {
         bus.is_dead.store(false, SeqCst);
         engine.check().unwrap();
         assert_eq!(bus.opened.load(SeqCst), 2);
+    }
+
+    #[test]
+    fn the_next_is_taken_where_the_first_does_not_open_and_is_kept() {
+        let buses = [Arc::new(Bus::default()), Arc::new(Bus::default())];
+        let opened = || buses.each_ref().map(|bus| bus.opened.load(SeqCst));
+        let engine = ReopeningEngine::new(vec![named("Card A", &buses[0]), named("Card B", &buses[1])]);
+        buses.iter().for_each(|bus| bus.is_dead.store(true, SeqCst));
+        let error = engine.check().unwrap_err().to_string();
+        assert!(error.matches("no driver").count() == 2 && error.contains("--device cpu"), "{error}");
+        buses[1].is_dead.store(false, SeqCst);
+        engine.check().unwrap();
+        assert_eq!((engine.device_name(), opened()), (Some("Card B"), [0, 1]));
+        // Results of another device would differ: the one that was lost is waited for.
+        buses[0].is_dead.store(false, SeqCst);
+        buses[1].is_dead.store(true, SeqCst);
+        buses[1].is_lost.store(true, SeqCst);
+        assert!(engine.check().is_err());
+        buses[1].is_dead.store(false, SeqCst);
+        engine.check().unwrap();
+        assert_eq!((engine.device_name(), opened()), (Some("Card B"), [0, 2]));
     }
 }

@@ -103,7 +103,7 @@ fn open(device: &str) -> Result<GpuDevice> {
             // Software if there is any; else the error says what is there.
             Err(_) => devices().first().map_or(DeviceChoice::Auto, |first| DeviceChoice::Index(first.index)),
         },
-        one => DeviceChoice::written(one),
+        one => one.parse()?,
     };
     Ok(GpuDevice::open(&choice)?)
 }

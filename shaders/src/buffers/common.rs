@@ -2,9 +2,9 @@
 
 use bytemuck::{Pod, bytes_of};
 use splat::engine::EngineError;
-use wgpu::{BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages};
+use wgpu::{BindingResource, BufferBinding, BufferSize, BufferUsages};
 
-use super::{Request, allocate, storage, uniform};
+use super::{Buffer, Request, allocate, storage, uniform};
 use crate::{
     device::GpuDevice,
     layout::{ScanSettings, SortSettings, State, Step},
@@ -28,8 +28,11 @@ pub(crate) struct CommonBuffers {
 
 impl CommonBuffers {
     pub(crate) fn new(device: &GpuDevice) -> Result<Self, EngineError> {
-        let indirect =
-            Request { label: "dispatches", bytes: 32, usage: BufferUsages::STORAGE | BufferUsages::INDIRECT };
+        let indirect = Request {
+            label: "dispatches",
+            bytes: 32,
+            usage: BufferUsages::STORAGE | BufferUsages::INDIRECT | BufferUsages::COPY_SRC,
+        };
         let requests = [
             uniform("step", size_of::<Step>() as u64),
             storage("state", size_of::<State>() as u64),

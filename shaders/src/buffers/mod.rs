@@ -6,8 +6,10 @@ pub(crate) mod parameters;
 mod raster;
 mod training;
 
+use std::{ops::Deref, sync::Arc};
+
 use splat::engine::EngineError;
-use wgpu::{Buffer, BufferDescriptor, BufferUsages, ErrorFilter};
+use wgpu::{BufferDescriptor, BufferUsages, ErrorFilter};
 
 pub(crate) use self::{
     common::{CommonBuffers, DEPTH_PASSES},
@@ -16,7 +18,7 @@ pub(crate) use self::{
     raster::{Buffers, DIGITS, FootprintBuffers, IntersectionBuffers, SortBuffers, first_capacity},
     training::{GradientBuffers, LossBuffers, OptimiserBuffers, training_image, training_requests},
 };
-use crate::device::GpuDevice;
+use crate::device::{GpuDevice, Reservation};
 
 /// Elements of one block of the sort and of the scan.
 pub(crate) const BLOCK: u64 = 1024;
@@ -56,14 +58,39 @@ pub(crate) fn uniform(label: &'static str, bytes: u64) -> Request {
     Request { label, bytes, usage: BufferUsages::UNIFORM | BufferUsages::COPY_DST }
 }
 
+/// A buffer on the device, and its part of what the device has to give.
+#[derive(Clone, Debug)]
+pub(crate) struct Buffer {
+    buffer: wgpu::Buffer,
+    /// After the buffer: it is freed before it is given back.
+    _held: Arc<Reservation>,
+}
+
+impl Deref for Buffer {
+    type Target = wgpu::Buffer;
+
+    fn deref(&self) -> &wgpu::Buffer {
+        &self.buffer
+    }
+}
+
+/// All bytes of the requests.
+pub(crate) fn total(requests: &[Request]) -> u64 {
+    requests.iter().map(|request| request.bytes).fold(0, u64::saturating_add)
+}
+
 /// Whether the device would grant all of them, before the first is made; with the figures if not.
 pub(crate) fn admit(device: &GpuDevice, requests: &[Request]) -> Result<(), EngineError> {
-    let needed: u64 = requests.iter().map(|request| request.bytes).sum();
-    if let Some(available) = device.memory_limit()
-        && needed > available
-    {
-        return Err(EngineError::OutOfResources { needed, available });
-    }
+    admit_instead(device, requests, 0)
+}
+
+/// The same when so many of the bytes that are held now are given back first.
+pub(crate) fn admit_instead(
+    device: &GpuDevice,
+    requests: &[Request],
+    returned: u64,
+) -> Result<(), EngineError> {
+    device.account().admit(total(requests), returned)?;
     match requests.iter().map(|request| request.bytes).max() {
         Some(largest) if largest > device.max_buffer() => {
             Err(EngineError::OutOfResources { needed: largest, available: device.max_buffer() })
@@ -78,22 +105,21 @@ pub(crate) fn allocate<const COUNT: usize>(
     requests: [Request; COUNT],
 ) -> Result<[Buffer; COUNT], EngineError> {
     admit(device, &requests)?;
+    let mut held = device.account().reserve(total(&requests))?;
     let scope = device.device.push_error_scope(ErrorFilter::OutOfMemory);
     let buffers = requests.map(|request| {
-        device.device.create_buffer(&BufferDescriptor {
+        let buffer = device.device.create_buffer(&BufferDescriptor {
             label: Some(request.label),
             // A binding must not be empty, and copies are of whole words.
             size: request.bytes.max(32).next_multiple_of(4),
             usage: request.usage,
             mapped_at_creation: false,
-        })
+        });
+        Buffer { buffer, _held: Arc::new(held.split(request.bytes)) }
     });
     match pollster::block_on(scope.pop()) {
         // The driver says that it has no more, not how much it has.
-        Some(_) => Err(EngineError::OutOfResources {
-            needed: requests.iter().map(|request| request.bytes).sum(),
-            available: 0,
-        }),
+        Some(_) => Err(EngineError::OutOfResources { needed: total(&requests), available: 0 }),
         None => Ok(buffers),
     }
 }

@@ -1,12 +1,12 @@
 //! What footprints are measured with, beyond what they are listed with.
 
 use splat::{engine::EngineError, tracking::TrackField};
-use wgpu::Buffer;
 
-use super::{Request, Size, allocate, storage};
+use super::{Buffer, Request, Size, allocate, storage};
 use crate::{
     device::GpuDevice,
     layout::{Expectation, Moments},
+    transfer::write,
 };
 
 /// The tracks of a view, and sums and moments under them.
@@ -45,15 +45,20 @@ impl MomentBuffers {
             allocate(device, Self::requests(size))?;
         let shown = tracks.sigma.iter().zip(&tracks.visible);
         let sigma: Vec<f32> = shown.map(|(&sigma, &visible)| if visible { sigma } else { 0.0 }).collect();
-        device.queue.write_buffer(&positions, 0, bytemuck::cast_slice(&tracks.positions));
-        device.queue.write_buffer(&sigmas, 0, bytemuck::cast_slice(&sigma));
+        write(device, &positions, &tracks.positions)?;
+        write(device, &sigmas, &sigma)?;
         Ok(Self { positions, sigmas, expectations, wanted, sums, moments })
     }
 
     /// Says by what the next pass reweights each Gaussian's pixels, and whose moments it is to give.
-    pub(crate) fn ask(&self, device: &GpuDevice, expectations: &[Expectation], wanted: &[u32]) {
+    pub(crate) fn ask(
+        &self,
+        device: &GpuDevice,
+        expectations: &[Expectation],
+        wanted: &[u32],
+    ) -> Result<(), EngineError> {
         let numbers: Vec<u32> = std::iter::once(wanted.len() as u32).chain(wanted.iter().copied()).collect();
-        device.queue.write_buffer(&self.wanted, 0, bytemuck::cast_slice(&numbers));
-        device.queue.write_buffer(&self.expectations, 0, bytemuck::cast_slice(expectations));
+        write(device, &self.wanted, &numbers)?;
+        write(device, &self.expectations, expectations)
     }
 }

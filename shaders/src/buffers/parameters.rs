@@ -1,10 +1,9 @@
 //! The parameters of a set on the device.
 
 use splat::{engine::EngineError, gaussians::Gaussians};
-use wgpu::Buffer;
 
-use super::{Request, allocate, storage};
-use crate::{device::GpuDevice, layout::GEOMETRY};
+use super::{Buffer, Request, allocate, storage};
+use crate::{device::GpuDevice, layout::GEOMETRY, transfer::write};
 
 /// Parameters as the kernels read them: mean, rotation, log scale and logit opacity of each Gaussian in a row.
 pub(crate) fn interleaved(gaussians: &Gaussians) -> Vec<f32> {
@@ -64,8 +63,8 @@ impl ParameterBuffers {
         check_lengths(gaussians)?;
         let requests = Self::requests(gaussians.len() as u64, gaussians.sh_coefficients() as u64);
         let [geometry, sh] = allocate(device, requests)?;
-        device.queue.write_buffer(&geometry, 0, bytemuck::cast_slice(&interleaved(gaussians)));
-        device.queue.write_buffer(&sh, 0, bytemuck::cast_slice(&gaussians.sh));
+        write(device, &geometry, &interleaved(gaussians))?;
+        write(device, &sh, &gaussians.sh)?;
         Ok(Self { geometry, sh })
     }
 }

@@ -1,9 +1,10 @@
 //! What a view is drawn and differentiated with.
 
 use splat::engine::EngineError;
-use wgpu::Buffer;
 
-use super::{BLOCK, CommonBuffers, ParameterBuffers, Request, Size, allocate, storage};
+use super::{
+    BLOCK, Buffer, CommonBuffers, ParameterBuffers, Request, Size, admit_instead, allocate, storage, total,
+};
 use crate::{device::GpuDevice, layout::SUMS};
 
 /// Digits of one pass of the sort.
@@ -125,12 +126,11 @@ pub(crate) struct Buffers {
 impl Buffers {
     /// All buffers of a size.
     pub(crate) fn requests(size: &Size) -> Vec<Request> {
-        let groups: [&[Request]; 6] = [
+        let groups: [&[Request]; 5] = [
             &ParameterBuffers::requests(size.count, size.coefficients),
             &FootprintBuffers::requests(size.count),
             &SortBuffers::requests(size.count),
-            &IntersectionBuffers::requests(size.capacity, size.has_gradient),
-            &SortBuffers::requests(size.capacity),
+            &Self::of_intersections(size),
             &ImageBuffers::requests(size.pixels, size.tiles),
         ];
         groups.concat()
@@ -152,11 +152,20 @@ impl Buffers {
         })
     }
 
-    /// Replaces the buffers of the intersections by those of another capacity.
+    /// Replaces the buffers of the intersections by those of another capacity. Nothing changes where it is seen before that there is no
+    /// room; the old ones are freed before the new ones are made, so nothing may be bound to them or be at work on them.
     pub(crate) fn resize(&mut self, device: &GpuDevice, size: Size) -> Result<(), EngineError> {
+        let [old, new] = [self.size, size].map(|size| Self::of_intersections(&size));
+        admit_instead(device, &new, total(&old))?;
+        self.intersections = IntersectionBuffers::new(device, 0, size.has_gradient)?;
         self.intersections = IntersectionBuffers::new(device, size.capacity, size.has_gradient)?;
         self.size = size;
         Ok(())
+    }
+
+    fn of_intersections(size: &Size) -> Vec<Request> {
+        let of_lists = IntersectionBuffers::requests(size.capacity, size.has_gradient);
+        [&of_lists[..], &SortBuffers::requests(size.capacity)].concat()
     }
 }
 

@@ -1,10 +1,9 @@
 //! What a training session takes beyond a pass.
 
 use splat::engine::EngineError;
-use wgpu::Buffer;
 
-use super::{Buffers, Request, Size, allocate, storage};
-use crate::{device::GpuDevice, layout::GEOMETRY};
+use super::{Buffer, Buffers, Request, Size, allocate, storage};
+use crate::{device::GpuDevice, layout::GEOMETRY, transfer::write};
 
 /// Everything that a session takes: `images` are the pixels of each training image and
 /// whether it is packed, `active` the flags of the Gaussians and
@@ -83,7 +82,7 @@ impl OptimiserBuffers {
     pub(crate) fn new(device: &GpuDevice, size: &Size, active: &[bool]) -> Result<Self, EngineError> {
         let [a, b, c, d, flags] = allocate(device, Self::requests(size, active.len()))?;
         let values: Vec<u32> = active.iter().map(|&active| u32::from(active)).collect();
-        device.queue.write_buffer(&flags, 0, bytemuck::cast_slice(&values));
+        write(device, &flags, &values)?;
         Ok(Self { moments: [a, b, c, d], active: flags })
     }
 }

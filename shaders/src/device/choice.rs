@@ -1,6 +1,6 @@
 //! Which device is meant.
 
-use std::{collections::BTreeSet, fmt};
+use std::{collections::BTreeSet, fmt, str::FromStr};
 
 use super::{DeviceDescription, DeviceError, DeviceKind};
 
@@ -25,12 +25,17 @@ pub enum DeviceChoice {
     },
 }
 
-impl DeviceChoice {
-    /// As people write one of them: `gpu:N` by its number, everything else by its name.
-    pub fn written(text: &str) -> Self {
-        match text.strip_prefix("gpu:").and_then(|number| number.parse().ok()) {
-            Some(index) => Self::Index(index),
-            None => Self::Name(text.to_owned()),
+impl FromStr for DeviceChoice {
+    type Err = DeviceError;
+
+    /// As people write one of them, upper and lower case alike: `gpu` the best, `gpu:N` by its number, everything else by its name.
+    fn from_str(text: &str) -> Result<Self, DeviceError> {
+        let (name, lower) = (text.trim(), text.trim().to_lowercase());
+        match (lower.as_str(), lower.strip_prefix("gpu:").map(str::parse)) {
+            ("", _) | (_, Some(Err(_))) => Err(DeviceError::Unreadable { text: text.to_owned() }),
+            ("gpu", _) => Ok(Self::Auto),
+            (_, Some(Ok(index))) => Ok(Self::Index(index)),
+            (_, None) => Ok(Self::Name(name.to_owned())),
         }
     }
 }
@@ -212,9 +217,15 @@ mod tests {
 
     #[test]
     fn a_number_is_written_after_gpu_and_all_else_is_a_name() {
-        assert_eq!(DeviceChoice::written("gpu:2"), DeviceChoice::Index(2));
-        for name in ["llvmpipe", "gpu:", "gpu:x"] {
-            assert_eq!(DeviceChoice::written(name), by_name(name));
+        let read = |text: &str| text.parse::<DeviceChoice>().ok();
+        assert_eq!(read(" GPU:2"), Some(DeviceChoice::Index(2)));
+        assert_eq!(read("Gpu"), Some(DeviceChoice::Auto));
+        for name in ["llvmpipe", "GPU 2", "gpus"] {
+            assert_eq!(read(name), Some(by_name(name)));
+        }
+        for wrong in ["", " ", "gpu:", "gpu:x", "gpu:-1", "gpu:1.5"] {
+            let error = wrong.parse::<DeviceChoice>().map_err(|error| error.to_string());
+            assert!(matches!(&error, Err(why) if why.contains(&format!("`{wrong}`"))), "{error:?}");
         }
     }
 

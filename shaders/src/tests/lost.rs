@@ -1,15 +1,22 @@
-//! A device that goes away.
+//! A device that goes away or hangs, and one that is asked for what its rules forbid.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use splat::{
-    engine::{Engine, EngineError, SessionInput, TrainingView},
+    engine::{Engine, EngineError, Session, SessionInput, TrainingView},
     image::Image,
     optim::LearningRates,
 };
 
+use wgpu::{BufferUsages, PollError, PollType};
+
 use super::support::{arc, blobs, engine, open};
-use crate::GpuEngine;
+use crate::{
+    GpuEngine,
+    buffers::{Request, allocate},
+    session::GpuSession,
+    transfer::read,
+};
 
 const BLACK: [f32; 3] = [0.0; 3];
 
@@ -23,6 +30,18 @@ const RATES: LearningRates = LearningRates {
     sh_degree: 0,
 };
 
+fn input() -> SessionInput {
+    let camera = arc(1, 17, 13).swap_remove(0);
+    let image = Arc::new(Image::filled(17, 13, BLACK));
+    SessionInput {
+        gaussians: blobs(10, 0, 1),
+        views: vec![TrainingView { camera, image, mask: None }],
+        background: BLACK,
+        dssim_weight: 0.2,
+        frozen: Vec::new(),
+    }
+}
+
 #[test]
 fn a_lost_device_is_an_error_of_its_own() {
     if engine().is_none() {
@@ -30,17 +49,7 @@ fn a_lost_device_is_an_error_of_its_own() {
     }
     // Not the one that other tests use.
     let doomed = GpuEngine::new(open()).unwrap();
-    let camera = arc(1, 17, 13).swap_remove(0);
-    let image = Arc::new(Image::filled(17, 13, BLACK));
-    let mut session = doomed
-        .session(SessionInput {
-            gaussians: blobs(10, 0, 1),
-            views: vec![TrainingView { camera: camera.clone(), image, mask: None }],
-            background: BLACK,
-            dssim_weight: 0.2,
-            frozen: Vec::new(),
-        })
-        .unwrap();
+    let mut session = doomed.session(input()).unwrap();
     session.step(0, &RATES).unwrap();
     doomed.context.device.device.destroy();
     // A step only submits: what became of it shows where something is read back.
@@ -48,6 +57,77 @@ fn a_lost_device_is_an_error_of_its_own() {
     assert!(matches!(outcome, Err(EngineError::DeviceLost(_))), "{outcome:?}");
     let outcome = session.gaussians();
     assert!(matches!(outcome, Err(EngineError::DeviceLost(_))), "{outcome:?}");
-    let outcome = doomed.render(&blobs(10, 0, 1), &camera, BLACK);
+    let outcome = doomed.render(&blobs(10, 0, 1), &arc(1, 17, 13)[0], BLACK);
     assert!(matches!(outcome, Err(EngineError::DeviceLost(_))), "{outcome:?}");
+}
+
+#[test]
+fn a_device_that_hangs_is_lost_after_its_time() {
+    if engine().is_none() {
+        return;
+    }
+    // Waits as one does for work without end: until the time is over that the engine gives.
+    let device = open().with_patience(Duration::from_secs(7)).with_poll(|_, until| match until {
+        PollType::Wait { timeout: Some(patience), .. } if patience == Duration::from_secs(7) => {
+            Err(PollError::Timeout)
+        }
+        other => panic!("waits without end: {other:?}"),
+    });
+    let hung = GpuEngine::new(device).unwrap();
+    let mut session = hung.session(input()).unwrap();
+    session.step(0, &RATES).unwrap();
+    let outcome = session.take_losses();
+    assert!(
+        matches!(&outcome, Err(EngineError::DeviceLost(why)) if why.contains("hangs") && why.contains("7 s")),
+        "{outcome:?}"
+    );
+    let outcome = hung.render(&blobs(10, 0, 1), &arc(1, 17, 13)[0], BLACK);
+    assert!(matches!(outcome, Err(EngineError::DeviceLost(_))), "{outcome:?}");
+    assert!(matches!(hung.check(), Err(EngineError::DeviceLost(_))));
+}
+
+#[test]
+fn a_broken_rule_fails_who_broke_it_and_nobody_else() {
+    let Some(engine) = engine() else { return };
+    let device = &engine.context.device;
+    let (gaussians, camera) = (blobs(10, 0, 1), arc(1, 17, 13).swap_remove(0));
+    let mut good = engine.session(input()).unwrap();
+    let mut bad = GpuSession::new(Arc::clone(&engine.context), input()).unwrap();
+    bad.break_buffers();
+    good.step(0, &RATES).unwrap();
+    for _ in 0..2 {
+        let outcome = bad.step(0, &RATES).and_then(|()| bad.take_losses());
+        assert!(matches!(outcome, Err(EngineError::Internal(_))), "{outcome:?}");
+    }
+    drop(bad);
+    // A copy from a buffer that is not for copies.
+    let outcome = device.guarded(|| {
+        let usage = BufferUsages::UNIFORM;
+        let [closed] = allocate(device, [Request { label: "closed", bytes: 64, usage }])?;
+        read::<u32>(device, &closed, 4)
+    });
+    assert!(matches!(outcome, Err(EngineError::Internal(_))), "{outcome:?}");
+    engine.check().unwrap();
+    engine.render(&gaussians, &camera, BLACK).unwrap();
+    good.step(0, &RATES).unwrap();
+    assert_eq!(good.take_losses().unwrap().len(), 2);
+}
+
+#[test]
+fn a_device_that_is_lost_for_want_of_memory_is_out_of_resources() {
+    if engine().is_none() {
+        return;
+    }
+    let doomed = GpuEngine::new(open()).unwrap();
+    let mut session = doomed.session(input()).unwrap();
+    let held = doomed.context.device.account().held();
+    doomed.context.device.lose(&wgpu::hal::DeviceError::OutOfMemory.to_string());
+    for outcome in [doomed.check(), session.step(0, &RATES)] {
+        assert!(
+            matches!(outcome, Err(EngineError::OutOfResources { needed, available: 0 }) if needed == held),
+            "{outcome:?}"
+        );
+    }
+    let text = doomed.check().unwrap_err().to_string();
+    assert!(text.contains(&format!("{held} bytes")) && text.contains("grants no more"), "{text}");
 }

@@ -7,10 +7,12 @@
 
 mod layout;
 mod lost;
+mod memory;
 mod moments;
 mod optimisation;
 mod projection;
 mod sorting;
+mod stages;
 #[path = "../../tests/gpu/support.rs"]
 pub(crate) mod support;
 

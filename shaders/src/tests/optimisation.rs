@@ -16,11 +16,12 @@ use super::{
     support::{self, arc, blobs, seeds},
 };
 use crate::{
+    GpuEngine,
     buffers::{GradientBuffers, LossBuffers, OptimiserBuffers, parameters::interleaved, separated},
     layout::{GEOMETRY, State, Step, View},
-    readback::read,
     session::{SessionView, session_view},
     stages::Binder,
+    transfer::read,
 };
 
 /// Values about and beyond [0, 1].
@@ -39,8 +40,6 @@ fn rounded(image: &Image) -> Image {
 #[test]
 fn the_loss_and_its_gradient_are_those_of_the_cpu_engine() {
     let Some(engine) = support::engine() else { return };
-    let context = &*engine.context;
-    let device = &context.device;
     for (width, height, weight, is_masked) in [
         (1, 1, 0.2, false),
         (17, 13, 0.2, false),
@@ -48,50 +47,63 @@ fn the_loss_and_its_gradient_are_those_of_the_cpu_engine() {
         (33, 70, 0.0, true),
         (5, 90, 1.0, false),
     ] {
-        let rendered = image(width, height, 0);
-        let wanted = image(width, height, 7);
-        let wanted = if is_masked { rounded(&wanted) } else { wanted };
-        let pixels = (width * height) as usize;
-        let inside: Vec<bool> = (0..pixels).map(|pixel| !is_masked || pixel % 7 < 4).collect();
-        let mask = Mask { width, height, inside };
-        let mut expected = vec![0.0; 3 * pixels];
-        let value = PhotometricLoss::new(&wanted, is_masked.then_some(&mask), weight).evaluate(
-            &rendered,
-            &mut LossWorkspace::default(),
-            &mut expected,
-        );
+        check_loss(engine, [width, height], weight, is_masked, 0);
+    }
+}
 
-        let training = TrainingView {
-            camera: arc(1, width, height).swap_remove(0),
-            image: Arc::new(wanted),
-            mask: is_masked.then(|| Arc::new(mask)),
-        };
-        let SessionView { view, wanted, .. } = session_view(device, &training, [0.0; 3], weight).unwrap();
-        assert_eq!(view.data.is_packed, u32::from(is_masked), "masked ones have 8 bits here");
-        let gaussians = blobs(1, 0, 1);
-        let buffers = engine.buffers(&gaussians, &view.data, true).unwrap();
-        let gradients = GradientBuffers::new(device, &buffers.size).unwrap();
-        let loss = LossBuffers::new(device, &buffers.size, 4).unwrap();
-        let colours = rendered.pixels.as_chunks::<3>().0.iter();
-        let shown: Vec<[f32; 4]> = colours.map(|&[red, green, blue]| [red, green, blue, 0.5]).collect();
-        device.queue.write_buffer(&buffers.images.rendered, 0, bytemuck::cast_slice(&shown));
-        let step = Step { loss_place: 2, ..Step::default() };
-        device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
-        let binder = Binder { device, kernels: &context.kernels };
-        run(context, &binder.loss(&buffers, &gradients, &loss, &view, &wanted));
+/// The loss between two images that `phase` chooses; masked ones are of 8 bits.
+pub(super) fn check_loss(
+    engine: &GpuEngine,
+    [width, height]: [u32; 2],
+    weight: f32,
+    is_masked: bool,
+    phase: usize,
+) {
+    let context = &*engine.context;
+    let device = &context.device;
+    let rendered = image(width, height, phase);
+    let wanted = image(width, height, phase + 7);
+    let wanted = if is_masked { rounded(&wanted) } else { wanted };
+    let pixels = (width * height) as usize;
+    let inside: Vec<bool> = (0..pixels).map(|pixel| !is_masked || pixel % 7 < 4).collect();
+    let mask = Mask { width, height, inside };
+    let mut expected = vec![0.0; 3 * pixels];
+    let value = PhotometricLoss::new(&wanted, is_masked.then_some(&mask), weight).evaluate(
+        &rendered,
+        &mut LossWorkspace::default(),
+        &mut expected,
+    );
 
-        let found: Vec<f32> = read(device, &loss.losses, 3).unwrap();
-        assert!((found[2] - value).abs() < 2e-6 * value, "{width}x{height}: {} for {value}", found[2]);
-        let found: Vec<[f32; 4]> = read(device, &gradients.image, pixels).unwrap();
-        let largest = expected.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
-        for (pixel, expected) in expected.as_chunks::<3>().0.iter().enumerate() {
-            for channel in 0..3 {
-                // The variance of a window is a difference of sums: 1e-7 of the square of the values, over its own size.
-                let off = (found[pixel][channel] - expected[channel]).abs();
-                assert!(off < 2e-5 * largest, "{width}x{height}, pixel {pixel}: off by {off} of {largest}");
-            }
-            assert_eq!(found[pixel][3], 0.0, "no gradient by alpha");
+    let training = TrainingView {
+        camera: arc(1, width, height).swap_remove(0),
+        image: Arc::new(wanted),
+        mask: is_masked.then(|| Arc::new(mask)),
+    };
+    let SessionView { view, wanted, .. } = session_view(device, &training, [0.0; 3], weight).unwrap();
+    assert_eq!(view.data.is_packed, u32::from(is_masked), "masked ones have 8 bits here");
+    let gaussians = blobs(1, 0, 1);
+    let buffers = engine.buffers(&gaussians, &view.data, true).unwrap();
+    let gradients = GradientBuffers::new(device, &buffers.size).unwrap();
+    let loss = LossBuffers::new(device, &buffers.size, 4).unwrap();
+    let colours = rendered.pixels.as_chunks::<3>().0.iter();
+    let shown: Vec<[f32; 4]> = colours.map(|&[red, green, blue]| [red, green, blue, 0.5]).collect();
+    device.queue.write_buffer(&buffers.images.rendered, 0, bytemuck::cast_slice(&shown));
+    let step = Step { loss_place: 2, ..Step::default() };
+    device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
+    let binder = Binder { device, kernels: &context.kernels };
+    run(context, &binder.loss(&buffers, &gradients, &loss, &view, &wanted));
+
+    let found: Vec<f32> = read(device, &loss.losses, 3).unwrap();
+    assert!((found[2] - value).abs() < 2e-6 * value, "{width}x{height}: {} for {value}", found[2]);
+    let found: Vec<[f32; 4]> = read(device, &gradients.image, pixels).unwrap();
+    let largest = expected.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
+    for (pixel, expected) in expected.as_chunks::<3>().0.iter().enumerate() {
+        for channel in 0..3 {
+            // The variance of a window is a difference of sums: 1e-7 of the square of the values, over its own size.
+            let off = (found[pixel][channel] - expected[channel]).abs();
+            assert!(off < 2e-5 * largest, "{width}x{height}, pixel {pixel}: off by {off} of {largest}");
         }
+        assert_eq!(found[pixel][3], 0.0, "no gradient by alpha");
     }
 }
 
@@ -108,20 +120,26 @@ const RATES: LearningRates = LearningRates {
 #[test]
 fn descent_is_that_of_the_cpu_engine() {
     let Some(engine) = support::engine() else { return };
+    check_descent(engine, 150, 2, 8);
+}
+
+/// Four steps by random gradients; a quarter of the Gaussians is frozen.
+pub(super) fn check_descent(engine: &GpuEngine, count: usize, degree: u32, seed: u64) {
+    let coefficients = (degree as usize + 1).pow(2);
     let context = &*engine.context;
     let device = &context.device;
-    let start = blobs(150, 2, 8);
-    let active: Vec<bool> = (0..150).map(|index| index % 4 != 1).collect();
+    let start = blobs(count, degree, seed);
+    let active: Vec<bool> = (0..count).map(|index| index % 4 != 1).collect();
     let view = View::new(&arc(1, 8, 8)[0], [0.0; 3]);
     let buffers = engine.buffers(&start, &view, true).unwrap();
     let gradients = GradientBuffers::new(device, &buffers.size).unwrap();
     let optimiser = OptimiserBuffers::new(device, &buffers.size, &active).unwrap();
-    let state = State { gaussians: 150, ..State::default() };
+    let state = State { gaussians: count as u32, ..State::default() };
     device.queue.write_buffer(&buffers.common.state, 0, bytes_of(&state));
     let (mut expected, mut adam) = (start.clone(), Adam::new(&start));
     for number in 1..=4 {
         // Sizes from 1e-12 to 1: the optimiser makes them equal.
-        let mut by = blobs(150, 2, 80 + number);
+        let mut by = blobs(count, degree, 1000 + 4 * seed + number);
         for (index, mean) in by.means.iter_mut().enumerate() {
             *mean = mean.map(|value| value * 10.0_f32.powi(-((index % 13) as i32)));
         }
@@ -136,8 +154,8 @@ fn descent_is_that_of_the_cpu_engine() {
         device.queue.write_buffer(&gradients.geometry, 0, bytemuck::cast_slice(&interleaved(&by)));
         device.queue.write_buffer(&gradients.sh, 0, bytemuck::cast_slice(&by.sh));
         let step = Step {
-            count: 150,
-            coefficients: 9,
+            count: count as u32,
+            coefficients: coefficients as u32,
             degree: RATES.sh_degree,
             rates: [RATES.mean, RATES.rotation, RATES.log_scale, RATES.logit_opacity],
             sh_rates: [RATES.sh_dc, RATES.sh_rest],
@@ -148,11 +166,12 @@ fn descent_is_that_of_the_cpu_engine() {
         };
         device.queue.write_buffer(&buffers.common.step, 0, bytes_of(&step));
         let binder = Binder { device, kernels: &context.kernels };
-        run(context, &binder.adam(&buffers, &gradients, &optimiser, 9));
+        run(context, &binder.adam(&buffers, &gradients, &optimiser, coefficients as u64));
     }
-    let geometry: Vec<[f32; GEOMETRY]> = read(device, &buffers.parameters.geometry, 150).unwrap();
-    let found = separated(&geometry, read(device, &buffers.parameters.sh, 27 * 150).unwrap(), 2);
-    for index in 0..150 {
+    let geometry: Vec<[f32; GEOMETRY]> = read(device, &buffers.parameters.geometry, count).unwrap();
+    let found =
+        separated(&geometry, read(device, &buffers.parameters.sh, 3 * coefficients * count).unwrap(), degree);
+    for index in 0..count {
         if !active[index] {
             assert_eq!(found.select(&[index]), start.select(&[index]), "frozen Gaussian {index}");
         }

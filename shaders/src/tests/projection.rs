@@ -7,19 +7,19 @@ use super::support::{self, arc, blobs};
 use crate::{
     buffers::Buffers,
     layout::{TILE, View},
-    readback::read,
     stages::{ViewBuffer, sorted_slots, tile_passes},
+    transfer::read,
 };
 
 /// The ellipse of a Gaussian whose Jacobian is not clamped.
-struct Reference {
-    mean: DVec2,
-    covariance: DMat2,
+pub(super) struct Reference {
+    pub mean: DVec2,
+    pub covariance: DMat2,
     depth: f64,
-    opacity: f64,
+    pub opacity: f64,
 }
 
-fn reference(gaussians: &Gaussians, index: usize, camera: &Camera) -> Reference {
+pub(super) fn reference(gaussians: &Gaussians, index: usize, camera: &Camera) -> Reference {
     let point = camera.to_camera(gaussians.mean(index));
     let [across, along] = camera.world_jacobian(point);
     let covariance = gaussians.covariance(index);

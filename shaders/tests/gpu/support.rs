@@ -59,7 +59,7 @@ pub(crate) fn open() -> GpuDevice {
 fn choice() -> Option<DeviceChoice> {
     match std::env::var("TRACKERSPLAT_TEST_DEVICE").as_deref() {
         Ok("none") => None,
-        Ok(one) => Some(DeviceChoice::written(one)),
+        Ok(one) => Some(one.parse().unwrap_or_else(|error| panic!("TRACKERSPLAT_TEST_DEVICE: {error}"))),
         Err(_) if GpuDevice::open(&DeviceChoice::Auto).is_ok() => Some(DeviceChoice::Auto),
         Err(_) => Some(DeviceChoice::Index(devices().first().map_or(0, |device| device.index))),
     }
