@@ -9,6 +9,8 @@ mod chain;
 mod coarse;
 mod consistency;
 mod flow;
+pub mod learned;
+mod matcher;
 mod pair;
 mod patches;
 mod planes;
