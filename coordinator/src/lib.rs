@@ -20,6 +20,7 @@ mod driver;
 mod failure;
 mod hub;
 mod keys;
+mod model;
 mod options;
 mod output;
 pub mod queue;

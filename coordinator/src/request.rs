@@ -40,6 +40,8 @@ pub(crate) enum TrackSource {
     /// The clip's own, in order of the training views; none where the job needs no tracks.
     Exact(Vec<InputFile>),
     Files(Vec<InputFile>),
+    /// Computed by a neural network from this file.
+    Learned(InputFile),
 }
 
 /// What a submission asks for besides clip, output and settings.
@@ -88,6 +90,9 @@ impl JobRequest {
         let mut request = Self { clip_url: None, ..self.clone() };
         let nameless = |file: &mut InputFile| file.path.clear();
         request.static_model.iter_mut().for_each(nameless);
+        if let TrackSource::Learned(model) = &mut request.tracks {
+            nameless(model);
+        }
         if let TrackSource::Exact(files) = &mut request.tracks {
             files.iter_mut().for_each(nameless);
         }

@@ -8,7 +8,7 @@ use splat::{
     clip::{Clip, Split},
     formats::{track_blob, track_npz},
     settings::{MotionSource, Settings},
-    tracking::{TrackField, track_view},
+    tracking::{TrackField, learned::LearnedTracker, track_view},
 };
 use tokio::sync::mpsc;
 use trackersplat_proto::v1::{Blob, FailureKind};
@@ -18,6 +18,7 @@ use crate::{
     compute::go_on,
     failure::StageError,
     keys::{TrackKey, VERSION, digest_of},
+    model,
     request::{InputFile, TrackSource},
     store::Artifact,
 };
@@ -53,8 +54,10 @@ impl Job {
         let _turn = self.turn().await?;
         let (fields, mut incoming) = mpsc::channel::<EncodedField>(PENDING_FIELDS);
         let total = (missing.len() * (self.frames.len() - 1)) as u64;
+        let model = self.learned_tracker().await?;
         let source = TrackRun {
             clip,
+            model,
             frames: self.frames.clone(),
             settings: self.settings.clone(),
             progress: StageProgress::new(self, "tracking"),
@@ -80,6 +83,17 @@ impl Job {
         go_on(&self.stop)
     }
 
+    /// The network that tracks, if one does.
+    async fn learned_tracker(&self) -> Result<Option<LearnedTracker>, StageError> {
+        let TrackSource::Learned(file) = &self.request.tracks else { return Ok(None) };
+        let (file, settings) = (file.clone(), self.settings.clone());
+        let load = move || -> Result<LearnedTracker, StageError> {
+            let bytes = model::read_again(&file).map_err(StageError::bad_input)?;
+            Ok(LearnedTracker::from_onnx(bytes, &file.path, &settings.tracking.onnx)?)
+        };
+        self.hub.compute.run(load).await.map(Some)
+    }
+
     async fn keep_tracks(&self, position: usize, index: usize, bytes: Bytes) -> Result<(), StageError> {
         let views = self.views().await?;
         let view = views.get(position).ok_or_else(|| {
@@ -98,6 +112,10 @@ impl Job {
         let source = match &self.request.tracks {
             TrackSource::Own => {
                 settings = digest_of(&self.settings.tracking);
+                settings.as_str()
+            }
+            TrackSource::Learned(model) => {
+                settings = digest_of(&(&self.settings.tracking, &model.digest));
                 settings.as_str()
             }
             TrackSource::Exact(_) | TrackSource::Files(_) => self.track_file(position, view)?.digest.as_str(),
@@ -134,7 +152,7 @@ impl Job {
         for (position, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train)
         {
             let file = match &self.request.tracks {
-                TrackSource::Own => None,
+                TrackSource::Own | TrackSource::Learned(_) => None,
                 TrackSource::Exact(_) | TrackSource::Files(_) => {
                     Some(self.track_file(position, &view.name)?.clone())
                 }
@@ -168,6 +186,7 @@ struct TrackRun {
     clip: Arc<Clip>,
     frames: Vec<u32>,
     settings: Arc<Settings>,
+    model: Option<LearnedTracker>,
     progress: StageProgress,
     total: u64,
     fields: mpsc::Sender<EncodedField>,
@@ -178,7 +197,8 @@ impl TrackRun {
         let Some(file) = &view.file else { return self.track(view) };
         let path = Path::new(&file.path);
         let is_exact = path == self.clip.exact_flow_path(view.position);
-        let read = if is_exact { track_npz::read_exact_flow(path) } else { track_npz::read_track_npz(path) };
+        let read =
+            if is_exact { track_npz::read_exact_flow(path) } else { track_npz::read_tracks(path, view.size) };
         // After reading: what was read is what is kept under the key of the submitted file.
         check_unchanged(view, file)?;
         let fields = read.map_err(|error| bad_tracks(view, error))?;
@@ -198,7 +218,11 @@ impl TrackRun {
             image.map_err(|error| StageError::bad_input(error.to_string()))
         };
         let mut emit = |index: usize, field: TrackField| self.emit(view, index, &field);
-        track_view(self.frames.len(), &mut load, &self.settings.tracking, &mut emit)
+        let (frames, settings) = (self.frames.len(), &self.settings.tracking);
+        match &self.model {
+            None => track_view(frames, &mut load, settings, &mut emit),
+            Some(model) => model.track_view(frames, &mut load, settings, &mut emit),
+        }
     }
 
     /// Runs on a thread of the compute pool: waiting for the store is how the store slows the tracker down.
