@@ -139,5 +139,11 @@ mod tests {
         assert_eq!(forward.settings_digest(&settings), backward.settings_digest(&settings));
         let swapped = named(vec![file("/a/cam00.npz", "2"), file("/a/cam01.npz", "1")]);
         assert_ne!(forward.settings_digest(&settings), swapped.settings_digest(&settings));
+
+        let by = |model| JobRequest { tracks: TrackSource::Learned(model), ..JobRequest::default() };
+        let digest = |path: &str, content: &str| by(file(path, content)).settings_digest(&settings);
+        assert_eq!(digest("/a/raft.onnx", "1"), digest("/b/copy.onnx", "1"));
+        assert_ne!(digest("/a/raft.onnx", "1"), digest("/a/raft.onnx", "2"));
+        assert_ne!(digest("/a/raft.onnx", "1"), JobRequest::default().settings_digest(&settings));
     }
 }

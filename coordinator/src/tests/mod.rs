@@ -2,6 +2,7 @@
 
 mod harness;
 mod jobs;
+mod learned;
 mod leases;
 mod ownership;
 mod remote_clips;
