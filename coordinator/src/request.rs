@@ -25,6 +25,11 @@ impl InputFile {
         Ok(Self { path: path.display().to_string(), digest: hasher.finalize().to_hex().to_string() })
     }
 
+    /// File name.
+    pub(crate) fn name(&self) -> &str {
+        Path::new(&self.path).file_name().and_then(|name| name.to_str()).unwrap_or_default()
+    }
+
     /// File name without its ending.
     pub(crate) fn stem(&self) -> &str {
         Path::new(&self.path).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default()

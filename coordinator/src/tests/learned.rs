@@ -6,7 +6,7 @@ use splat::{formats::track_blob, tracking::TrackField};
 use tonic::Code;
 use trackersplat_proto::v1::{JobState, SubmitRequest, job_event::Event, submit_request::Tracks};
 
-use super::harness::Bench;
+use super::harness::{Bench, frame_job, track_job};
 
 #[derive(Clone, PartialEq, Message)]
 struct Model {
@@ -106,8 +106,8 @@ async fn tracked_by(file: &str, network: &[u8]) -> Vec<TrackField> {
     let tracked = |event: &Event| matches!(event, Event::JobState(s) if s.state() == JobState::Frames);
     bench.watch(&job, 0).await.until(tracked).await;
     let (mut first, mut second) = (bench.worker("a").await, bench.worker("b").await);
-    assert!(first.lease().await.job.unwrap().key_frame);
-    let frame = second.lease().await.job.unwrap();
+    assert!(frame_job(&first.lease().await).key_frame);
+    let frame = frame_job(&second.lease().await);
     let mut fields = Vec::new();
     for view in &frame.training_views {
         let tracks = bench.get(&view.tracks.as_ref().unwrap().digest).await.unwrap();
@@ -128,6 +128,20 @@ async fn a_network_tracks_in_place_of_the_built_in_tracker() {
             assert_eq!(field.positions[index], [4.5 + motion[0], 3.5 + motion[1]], "{file}");
         }
     }
+}
+
+#[tokio::test]
+async fn workers_get_the_network_by_its_digest() {
+    let bench = Bench::start().await;
+    let bytes = network([1.0, 0.0]);
+    std::fs::write(bench.path("net.onnx"), &bytes).unwrap();
+    let mut worker = bench.worker("w").await;
+    bench.submit(submission(&bench, "net.onnx")).await.unwrap();
+    let tracker = track_job(&worker.lease().await).tracker.unwrap();
+    assert_eq!(tracker.model_name, "net.onnx");
+    let model = tracker.model.unwrap();
+    assert_eq!(model.digest, blake3::hash(&bytes).to_hex().as_str());
+    assert_eq!(bench.get(&model.digest).await.unwrap(), bytes);
 }
 
 #[tokio::test]

@@ -9,4 +9,5 @@ mod remote_clips;
 mod reports;
 mod restart;
 mod runs;
+mod tracks;
 mod transfers;
