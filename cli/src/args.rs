@@ -2,6 +2,7 @@
 
 use std::{
     path::{Path, PathBuf},
+    str::FromStr,
     sync::Arc,
 };
 
@@ -57,8 +58,32 @@ pub(crate) struct JobArgs {
     #[arg(long, value_name = "exact|FILE", num_args = 1.., help_heading = "Input")]
     pub(crate) tracks: Vec<String>,
 
+    /// A neural network in place of the built-in tracker: an ONNX file, as docs/trackers.md describes it.
+    #[arg(long, value_name = "onnx:FILE", conflicts_with = "tracks", help_heading = "Input")]
+    pub(crate) tracker: Option<TrackerArg>,
+
     #[command(flatten)]
     pub(crate) settings: SettingsArgs,
+}
+
+/// A tracker that is not the built-in one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct TrackerArg {
+    /// ONNX file of the network.
+    pub(crate) file: String,
+}
+
+impl FromStr for TrackerArg {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text.strip_prefix("onnx:") {
+            Some(file) if !file.is_empty() => Ok(Self { file: file.to_owned() }),
+            _ => {
+                Err("write onnx:FILE, as in --tracker onnx:raft.onnx; leave it out for the built-in tracker")
+            }
+        }
+    }
 }
 
 /// How to reconstruct.
@@ -177,6 +202,9 @@ impl JobArgs {
     }
 
     fn tracks(&self) -> Result<Option<Tracks>, CliError> {
+        if let Some(tracker) = &self.tracker {
+            return Ok(Some(Tracks::TrackerModel(absolute(&tracker.file)?)));
+        }
         match self.tracks.as_slice() {
             [] => Ok(None),
             [one] if one == "exact" => Ok(Some(Tracks::ExactTracks(ExactTracks {}))),
@@ -411,6 +439,24 @@ mod tests {
         let refused = baseline(DeviceArg::Gpu).engine().err().unwrap();
         assert_eq!(refused.exit_code(), 3);
         assert!(refused.to_string().contains("--instructions baseline"), "{refused}");
+    }
+
+    #[test]
+    fn a_tracker_is_an_onnx_file_and_excludes_tracks() {
+        let Some(Tracks::TrackerModel(file)) =
+            request(&["clip", "--tracker", "onnx:nets/raft.onnx"]).unwrap().tracks
+        else {
+            panic!("a tracker");
+        };
+        assert!(Path::new(&file).is_absolute() && file.ends_with("/nets/raft.onnx"));
+        for line in [
+            ["x", "clip", "--tracker", "raft.onnx"].as_slice(),
+            &["x", "clip", "--tracker", "onnx:"],
+            &["x", "clip", "--tracker", "onnx:a.onnx", "--tracks", "exact"],
+        ] {
+            let error = Line::try_parse_from(line).err().unwrap().to_string();
+            assert!(error.contains("--tracker"), "{error}");
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 use splat::frame::{FrameReport, ViewMetrics};
 use trackersplat_proto::v1::{
-    Failure, FailureKind, FrameState, FrameStateChanged, JobEvent, JobState, job_event::Event,
+    Failure, FailureKind, FrameStateChanged, JobEvent, JobState, TaskState, job_event::Event,
 };
 
 use crate::error::CliError;
@@ -55,19 +55,19 @@ impl Outcome {
                 self.failure = change.failure.clone();
             }
             Some(Event::FrameState(change)) => self.observe_frame(change),
-            Some(Event::Progress(_) | Event::Workers(_)) | None => {}
+            Some(Event::TracksState(_) | Event::Progress(_) | Event::Workers(_)) | None => {}
         }
     }
 
     fn observe_frame(&mut self, change: &FrameStateChanged) {
         let frame = self.frames.entry(change.frame).or_default();
-        frame.state = frame_state_label(change.state());
+        frame.state = task_state_label(change.state());
         frame.attempt = frame.attempt.max(change.attempt);
         frame.failure = change.failure.as_ref().map(|failure| failure.message.clone());
         if !change.worker_id.is_empty() {
             frame.worker.clone_from(&change.worker_id);
         }
-        if change.state() == FrameState::Done {
+        if change.state() == TaskState::Done {
             frame.seconds = change.seconds;
             // A report of a newer version may not be readable; the table then lacks its figures.
             frame.report = serde_json::from_str(&change.report_json).ok();
@@ -75,8 +75,8 @@ impl Outcome {
     }
 
     /// Numbers of the frames in a state.
-    pub(crate) fn frames_in(&self, state: FrameState) -> BTreeSet<u32> {
-        let label = frame_state_label(state);
+    pub(crate) fn frames_in(&self, state: TaskState) -> BTreeSet<u32> {
+        let label = task_state_label(state);
         self.frames.iter().filter(|(_, frame)| frame.state == label).map(|(number, _)| *number).collect()
     }
 
@@ -116,14 +116,14 @@ pub(crate) fn job_state_label(state: JobState) -> &'static str {
 }
 
 /// A frame's state for people and scripts.
-pub(crate) fn frame_state_label(state: FrameState) -> &'static str {
+pub(crate) fn task_state_label(state: TaskState) -> &'static str {
     match state {
-        FrameState::Unspecified => "unknown",
-        FrameState::Ready => "ready",
-        FrameState::Leased => "leased",
-        FrameState::Done => "done",
-        FrameState::Failed => "failed",
-        FrameState::Cancelled => "cancelled",
+        TaskState::Unspecified => "unknown",
+        TaskState::Ready => "ready",
+        TaskState::Leased => "leased",
+        TaskState::Done => "done",
+        TaskState::Failed => "failed",
+        TaskState::Cancelled => "cancelled",
     }
 }
 
@@ -138,7 +138,7 @@ pub(crate) mod tests {
         JobEvent { sequence, event: Some(Event::JobState(change)), ..JobEvent::default() }
     }
 
-    pub(crate) fn frame_event(sequence: u64, frame: u32, state: FrameState) -> JobEvent {
+    pub(crate) fn frame_event(sequence: u64, frame: u32, state: TaskState) -> JobEvent {
         let report = FrameReport {
             after: vec![ViewMetrics { view: "mean".into(), psnr: 30.0, ssim: 0.9, moving_psnr: Some(28.0) }],
             ..FrameReport::default()
@@ -159,15 +159,15 @@ pub(crate) mod tests {
         let mut outcome = Outcome::default();
         let events = [
             job_event(1, JobState::Frames, None),
-            frame_event(2, 1, FrameState::Leased),
-            frame_event(3, 2, FrameState::Ready),
-            frame_event(4, 1, FrameState::Done),
+            frame_event(2, 1, TaskState::Leased),
+            frame_event(3, 2, TaskState::Ready),
+            frame_event(4, 1, TaskState::Done),
         ];
         for _ in 0..2 {
             events.iter().for_each(|event| outcome.observe(event));
         }
         assert_eq!(outcome.last_sequence, 4);
-        assert_eq!(outcome.frames_in(FrameState::Done), BTreeSet::from([1]));
+        assert_eq!(outcome.frames_in(TaskState::Done), BTreeSet::from([1]));
         assert_eq!(outcome.frames[&1].seconds, 2.5);
         assert_eq!(outcome.frames[&1].means().1.map(|mean| mean.psnr), Some(30.0));
         assert_eq!(outcome.frames[&2].report, None);

@@ -59,7 +59,7 @@ fn change(before: Option<f64>, after: Option<f64>, digits: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use trackersplat_proto::v1::FrameState;
+    use trackersplat_proto::v1::TaskState;
 
     use super::*;
     use crate::outcome::tests::frame_event;
@@ -67,9 +67,9 @@ mod tests {
     #[test]
     fn a_row_per_frame_and_their_mean() {
         let mut outcome = Outcome::default();
-        outcome.observe(&frame_event(1, 1, FrameState::Done));
-        outcome.observe(&frame_event(2, 2, FrameState::Done));
-        outcome.observe(&frame_event(3, 3, FrameState::Failed));
+        outcome.observe(&frame_event(1, 1, TaskState::Done));
+        outcome.observe(&frame_event(2, 2, TaskState::Done));
+        outcome.observe(&frame_event(3, 3, TaskState::Failed));
         let text = frames(&outcome);
         let rows: Vec<&str> = text.lines().collect();
         assert_eq!(rows.len(), 5, "{text}");

@@ -42,28 +42,32 @@ CREATE TABLE images (
     PRIMARY KEY (job_id, frame, position)
 );
 
-CREATE TABLE frames (
+-- What workers do: frames, and the tracks of views.
+CREATE TABLE tasks (
     job_id        TEXT NOT NULL REFERENCES jobs (id),
-    frame         INTEGER NOT NULL,
+    kind          TEXT NOT NULL,                -- frame, tracks
+    number        INTEGER NOT NULL,             -- of the frame, or position of the view
     state         TEXT NOT NULL,                -- ready, leased, done, failed, cancelled
     attempts      INTEGER NOT NULL DEFAULT 0,   -- leases given
     failures      INTEGER NOT NULL DEFAULT 0,   -- attempts that failed
     excluded      TEXT NOT NULL DEFAULT '[]',   -- workers that lack the resources, JSON list
     worker        TEXT NOT NULL DEFAULT '',     -- of the last attempt
-    request       BLOB NOT NULL,                -- the frame job, protobuf
-    result_key    TEXT NOT NULL,                -- names the result among the artifacts
+    seconds       REAL NOT NULL DEFAULT 0,      -- from lease to result
+    changed_at    TEXT NOT NULL,
+    -- Of frames only; the fields of tracks are artifacts.
+    request       BLOB NOT NULL DEFAULT X'',    -- the frame job, protobuf
+    result_key    TEXT NOT NULL DEFAULT '',     -- names the result among the artifacts
     delta_digest  TEXT NOT NULL DEFAULT '',     -- set when done
     delta_size    INTEGER NOT NULL DEFAULT 0,
     report        TEXT NOT NULL DEFAULT '',     -- JSON, set when done
-    seconds       REAL NOT NULL DEFAULT 0,      -- from lease to result
     stage_seconds TEXT NOT NULL DEFAULT '{}',   -- JSON
-    changed_at    TEXT NOT NULL,
-    PRIMARY KEY (job_id, frame)
+    PRIMARY KEY (job_id, kind, number)
 );
 
 CREATE TABLE attempts (
     job_id     TEXT NOT NULL,
-    frame      INTEGER NOT NULL,
+    kind       TEXT NOT NULL,
+    number     INTEGER NOT NULL,
     attempt    INTEGER NOT NULL,
     lease_id   TEXT NOT NULL UNIQUE,
     worker     TEXT NOT NULL,
@@ -71,17 +75,18 @@ CREATE TABLE attempts (
     ended_at   TEXT NOT NULL DEFAULT '',
     outcome    TEXT NOT NULL DEFAULT 'running', -- running, done, released, cancelled, or the kind of failure
     message    TEXT NOT NULL DEFAULT '',
-    PRIMARY KEY (job_id, frame, attempt),
-    FOREIGN KEY (job_id, frame) REFERENCES frames (job_id, frame)
+    PRIMARY KEY (job_id, kind, number, attempt),
+    FOREIGN KEY (job_id, kind, number) REFERENCES tasks (job_id, kind, number)
 );
 
 CREATE TABLE events (
     job_id       TEXT NOT NULL REFERENCES jobs (id),
     sequence     INTEGER NOT NULL,              -- from 1, without gaps
     at           TEXT NOT NULL,
-    kind         TEXT NOT NULL,                 -- job, frame
+    kind         TEXT NOT NULL,                 -- job, frame, tracks
     state        TEXT NOT NULL,
-    frame        INTEGER NOT NULL DEFAULT 0,
+    number       INTEGER NOT NULL DEFAULT 0,    -- of the task
+    view         TEXT NOT NULL DEFAULT '',      -- name, of tracks
     attempt      INTEGER NOT NULL DEFAULT 0,
     worker       TEXT NOT NULL DEFAULT '',
     failure_kind TEXT NOT NULL DEFAULT '',

@@ -1,6 +1,6 @@
 //! Why a stage or a verification failed, in the kinds of the wire.
 
-use splat::{engine::EngineError, static_model::StaticModelError};
+use splat::{engine::EngineError, static_model::StaticModelError, tracking::learned::LearnedError};
 use trackersplat_proto::v1::{Failure, FailureKind};
 
 use crate::{blobs::BlobError, store::StoreError};
@@ -52,6 +52,12 @@ impl From<EngineError> for StageError {
             EngineError::Internal(_) => FailureKind::Bug,
         };
         Self::new(kind, error.to_string())
+    }
+}
+
+impl From<LearnedError> for StageError {
+    fn from(error: LearnedError) -> Self {
+        Self::bad_input(error.to_string())
     }
 }
 

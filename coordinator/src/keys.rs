@@ -36,15 +36,15 @@ pub(crate) struct StaticModelKey<'a> {
     pub(crate) settings: &'a splat::static_model::StaticModelSettings,
 }
 
-/// What decides the track field of one view and frame.
+/// What decides the imported track field of one view and frame.
 #[derive(Serialize)]
 pub(crate) struct TrackKey<'a> {
     pub(crate) kind: &'static str,
     pub(crate) version: &'static str,
-    /// Digest of the tracker's settings or of the imported file.
+    /// Digest of the imported file.
     pub(crate) source: &'a str,
     pub(crate) clip: &'a str,
-    /// Frames from the key frame to this one: tracks are chained through them.
+    /// Frames from the key frame to this one.
     pub(crate) frames: &'a [u32],
     pub(crate) view: &'a str,
 }

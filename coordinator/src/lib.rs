@@ -1,12 +1,13 @@
-//! The coordinator: ingests a clip, reconstructs the static model, tracks it, hands frame jobs to workers, and puts
-//! the results together.
+//! The coordinator: ingests a clip, reconstructs the static model, hands the tracks of views and frames
+//! to workers, and puts the results together.
 //!
 //! | module | idea |
 //! |---|---|
-//! | [`queue`] | which frame goes to which worker, and the states of jobs and frames: pure tables, time is a parameter |
+//! | [`queue`] | which task goes to which worker, and the states of jobs and tasks: pure tables, time is a parameter |
 //! | [`store`] | the state on disk, one SQLite file |
 //! | [`blobs`] | bulk bytes named by digest |
 //! | `hub` | where jobs, workers and clients meet: one lock orders every change |
+//! | `ledger` | which track fields of a job there are |
 //! | `driver` | a job from submission to its end, one file per stage |
 //! | `services` | the gRPC services of `trackersplat.v1`; `proto/PROTOCOL.md` is their reference |
 //! | `remote_clip` | a clip in an object store becomes a local one |
@@ -20,6 +21,8 @@ mod driver;
 mod failure;
 mod hub;
 mod keys;
+mod ledger;
+mod model;
 mod options;
 mod output;
 pub mod queue;

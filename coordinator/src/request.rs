@@ -25,6 +25,11 @@ impl InputFile {
         Ok(Self { path: path.display().to_string(), digest: hasher.finalize().to_hex().to_string() })
     }
 
+    /// File name.
+    pub(crate) fn name(&self) -> &str {
+        Path::new(&self.path).file_name().and_then(|name| name.to_str()).unwrap_or_default()
+    }
+
     /// File name without its ending.
     pub(crate) fn stem(&self) -> &str {
         Path::new(&self.path).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default()
@@ -40,6 +45,8 @@ pub(crate) enum TrackSource {
     /// The clip's own, in order of the training views; none where the job needs no tracks.
     Exact(Vec<InputFile>),
     Files(Vec<InputFile>),
+    /// Computed by a neural network from this file.
+    Learned(InputFile),
 }
 
 /// What a submission asks for besides clip, output and settings.
@@ -88,6 +95,9 @@ impl JobRequest {
         let mut request = Self { clip_url: None, ..self.clone() };
         let nameless = |file: &mut InputFile| file.path.clear();
         request.static_model.iter_mut().for_each(nameless);
+        if let TrackSource::Learned(model) = &mut request.tracks {
+            nameless(model);
+        }
         if let TrackSource::Exact(files) = &mut request.tracks {
             files.iter_mut().for_each(nameless);
         }
@@ -134,5 +144,11 @@ mod tests {
         assert_eq!(forward.settings_digest(&settings), backward.settings_digest(&settings));
         let swapped = named(vec![file("/a/cam00.npz", "2"), file("/a/cam01.npz", "1")]);
         assert_ne!(forward.settings_digest(&settings), swapped.settings_digest(&settings));
+
+        let by = |model| JobRequest { tracks: TrackSource::Learned(model), ..JobRequest::default() };
+        let digest = |path: &str, content: &str| by(file(path, content)).settings_digest(&settings);
+        assert_eq!(digest("/a/raft.onnx", "1"), digest("/b/copy.onnx", "1"));
+        assert_ne!(digest("/a/raft.onnx", "1"), digest("/a/raft.onnx", "2"));
+        assert_ne!(digest("/a/raft.onnx", "1"), JobRequest::default().settings_digest(&settings));
     }
 }

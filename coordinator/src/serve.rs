@@ -19,8 +19,9 @@ use tokio::{
 use tokio_stream::wrappers::TcpListenerStream;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Server;
-use trackersplat_proto::v1::{
-    blobs_server::BlobsServer, jobs_server::JobsServer, workers_server::WorkersServer,
+use trackersplat_proto::{
+    MAX_WORKER_MESSAGE,
+    v1::{blobs_server::BlobsServer, jobs_server::JobsServer, workers_server::WorkersServer},
 };
 
 use crate::{
@@ -162,7 +163,9 @@ async fn run(hub: Arc<Hub>, listener: TcpListener, lock: File) -> Result<(), Ser
         .tcp_nodelay(true)
         .max_concurrent_streams(CONCURRENT_STREAMS)
         .add_service(JobsServer::new(JobService::new(hub.clone())))
-        .add_service(WorkersServer::new(WorkService::new(hub.clone())))
+        .add_service(
+            WorkersServer::new(WorkService::new(hub.clone())).max_decoding_message_size(MAX_WORKER_MESSAGE),
+        )
         .add_service(BlobsServer::new(BlobService::new(hub.clone())))
         .serve_with_incoming_shutdown(TcpListenerStream::new(listener), shutdown.clone().cancelled_owned());
     let mut server = std::pin::pin!(server);

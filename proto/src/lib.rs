@@ -17,5 +17,8 @@ pub mod v1 {
     tonic::include_proto!("trackersplat.v1");
 }
 
+/// Largest message between a worker and the coordinator, either way: the tracks of a view over some 400 000 frames.
+pub const MAX_WORKER_MESSAGE: usize = 64 << 20;
+
 /// Bytes of data per streamed chunk, well below gRPC's limit of 4 MiB a message.
 pub const CHUNK_BYTES: usize = 256 << 10;

@@ -9,9 +9,12 @@ use tonic::{
     Code, Status, Streaming,
     transport::{Channel, Endpoint},
 };
-use trackersplat_proto::v1::{
-    CoordinatorMessage, Register, Welcome, WorkerMessage, coordinator_message, worker_message,
-    workers_client::WorkersClient,
+use trackersplat_proto::{
+    MAX_WORKER_MESSAGE,
+    v1::{
+        CoordinatorMessage, Register, Welcome, WorkerMessage, coordinator_message, worker_message,
+        workers_client::WorkersClient,
+    },
 };
 
 use crate::setup::WorkerError;
@@ -135,8 +138,8 @@ async fn handshake(channel: &Channel, register: &Register) -> Result<Connection,
     let first = WorkerMessage { message: Some(worker_message::Message::Register(register.clone())) };
     // Queued before the call: the coordinator may answer the call only once it has read the registration.
     outgoing.try_send(first).map_err(|error| ConnectionError::Lost(error.to_string()))?;
-    let mut incoming =
-        WorkersClient::new(channel.clone()).work(ReceiverStream::new(queue)).await?.into_inner();
+    let mut client = WorkersClient::new(channel.clone()).max_decoding_message_size(MAX_WORKER_MESSAGE);
+    let mut incoming = client.work(ReceiverStream::new(queue)).await?.into_inner();
     match next_message(&mut incoming).await? {
         coordinator_message::Message::Welcome(welcome) => Ok(Connection { outgoing, incoming, welcome }),
         other => {

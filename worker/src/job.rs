@@ -16,13 +16,14 @@ use splat::{
 };
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{Blob, Failure, FailureKind, FrameJob, StageSeconds, Success, report};
+use trackersplat_proto::v1::{Blob, Failure, FailureKind, FrameJob, StageSeconds, Success, lease, report};
 
 use crate::{
     ahead::Ahead,
     blobs::Blobs,
     connection::backoff,
     inputs::{self, InputCache},
+    tracks::Said,
 };
 
 /// What turns a frame's input into its result; `splat::frame::reconstruct_frame` on the worker's engine.
@@ -50,7 +51,7 @@ impl JobError {
     }
 }
 
-/// Runs frame jobs on one device, one at a time.
+/// Runs tasks on one device, one at a time.
 pub(crate) struct JobRunner {
     pub(crate) reconstruct: Reconstruct,
     pub(crate) pool: Arc<rayon::ThreadPool>,
@@ -62,20 +63,29 @@ pub(crate) struct JobRunner {
     pub(crate) jitter_seed: u64,
 }
 
-/// How a frame job ended, if it was not cancelled.
+/// How a task ended, if it was not cancelled.
 pub(crate) type Outcome = report::Outcome;
 
 impl JobRunner {
-    /// Runs one frame job to its report; `None` if it was cancelled. The inputs of `likely_next` are loaded meanwhile.
+    /// Does one task to its report; `None` if it was cancelled. The inputs of `likely_next` are loaded meanwhile.
     pub(crate) async fn run(
         &self,
-        job: &FrameJob,
+        task: lease::Task,
         likely_next: Option<FrameJob>,
         blobs: &Blobs,
-        progress: watch::Sender<FrameProgress>,
+        said: Said,
         cancel: &CancellationToken,
     ) -> Option<Outcome> {
-        match self.attempt(job, likely_next, blobs, progress, cancel).await {
+        let job = match task {
+            lease::Task::Frame(job) => job,
+            lease::Task::Tracks(job) => {
+                if let Some(next) = likely_next {
+                    self.ahead.begin(next, blobs.clone(), self.cache.clone());
+                }
+                return self.track(job, blobs.clone(), said, cancel.clone()).await;
+            }
+        };
+        match self.attempt(&job, likely_next, blobs, said.progress, cancel).await {
             Ok(Some(success)) => Some(Outcome::Success(success)),
             Ok(None) => None,
             Err(error) => Some(Outcome::Failure(Failure { kind: error.kind.into(), message: error.message })),
@@ -141,12 +151,7 @@ impl JobRunner {
             (result, clock)
         });
         // A cancelled job is waited for: the next one must not share the device with its last step.
-        let (result, clock) = work.await.map_err(|error| match error.try_into_panic() {
-            Ok(panic) => {
-                JobError::new(FailureKind::Bug, format!("the frame job panicked: {}", panic_text(&*panic)))
-            }
-            Err(error) => JobError::new(FailureKind::Bug, format!("the frame job did not end: {error}")),
-        })?;
+        let (result, clock) = work.await.map_err(|error| not_ended("the frame job", error))?;
         *stages = clock;
         match result {
             Ok(result) => Ok(Some(result)),
@@ -188,6 +193,15 @@ fn failure_of(error: FrameError) -> JobError {
         FrameError::Engine(EngineError::Internal(_)) => FailureKind::Bug,
     };
     JobError::new(kind, error.to_string())
+}
+
+/// Why blocking work has no result.
+pub(crate) fn not_ended(what: &str, error: tokio::task::JoinError) -> JobError {
+    let message = match error.try_into_panic() {
+        Ok(panic) => format!("{what} panicked: {}", panic_text(&*panic)),
+        Err(error) => format!("{what} did not end: {error}"),
+    };
+    JobError::new(FailureKind::Bug, message)
 }
 
 fn panic_text(panic: &(dyn Any + Send)) -> &str {

@@ -9,7 +9,7 @@ use std::{
 
 use splat::{engine::Engine, frame::FrameProgress};
 use tokio::{
-    sync::watch,
+    sync::{mpsc, watch},
     task::JoinHandle,
     time::{Instant, MissedTickBehavior, interval, interval_at},
 };
@@ -18,8 +18,8 @@ use tonic::transport::Channel;
 use trackersplat_proto::{
     ids::check_worker_id,
     v1::{
-        Failure, FailureKind, GoingAway, Heartbeat, Lease, LeaseRequest, Register, Report,
-        coordinator_message, worker_message,
+        Failure, FailureKind, FieldReport, FrameJob, GoingAway, Heartbeat, Lease, LeaseRequest, Register,
+        Report, TrackedField, coordinator_message, lease, worker_message,
     },
 };
 
@@ -29,6 +29,7 @@ use crate::{
     connection::{self, Connection, ConnectionError},
     job::{JobRunner, Outcome, Reconstruct},
     setup::{Exit, WorkerError, WorkerOptions, thread_pool, worker_id},
+    tracks::Said,
 };
 
 /// Longest wait for the last words to reach the coordinator, and for the running step to end, at shutdown.
@@ -110,11 +111,13 @@ pub(crate) async fn run_with(
     }
 }
 
-/// A lease whose frame is being computed.
+/// A lease whose task is being done.
 struct RunningLease {
     lease_id: String,
     attempt: u32,
     progress: watch::Receiver<FrameProgress>,
+    /// Track fields that are stored and not yet said.
+    fields: mpsc::UnboundedReceiver<TrackedField>,
     cancel: CancellationToken,
     task: JoinHandle<Option<Outcome>>,
 }
@@ -258,14 +261,17 @@ impl Worker {
                     }
                     coordinator_message::Message::Welcome(_) => tracing::warn!("a second welcome, ignored"),
                 },
-                outcome = finished(&mut self.running) => {
-                    self.unacknowledged = self.report_of(outcome);
-                    match self.unacknowledged {
-                        Some(_) => self.send_report(&connection)?,
-                        None => connection.send(worker_message::Message::LeaseRequest(LeaseRequest {}))?,
+                step = next_step(&mut self.running) => match step {
+                    Step::Field(field) => connection.send(worker_message::Message::Field(field))?,
+                    Step::Ended(outcome) => {
+                        self.unacknowledged = self.report_of(outcome);
+                        match self.unacknowledged {
+                            Some(_) => self.send_report(&connection)?,
+                            None => connection.send(worker_message::Message::LeaseRequest(LeaseRequest {}))?,
+                        }
+                        resend.reset();
                     }
-                    resend.reset();
-                }
+                },
                 _ = heartbeat.tick() => {
                     if self.running.is_none() && self.unacknowledged.is_none() {
                         self.runner.ahead.forget();
@@ -277,9 +283,9 @@ impl Worker {
         }
     }
 
-    /// Begins a lease. One at a time: a lease that comes while a frame runs is left to expire.
+    /// Begins a lease. One at a time: a lease that comes while a task runs is left to expire.
     fn start(&mut self, lease: Lease, blobs: &Blobs) {
-        let Lease { lease_id, attempt, job, likely_next } = lease;
+        let Lease { lease_id, attempt, task, likely_next } = lease;
         if let Some(running) = &self.running {
             tracing::warn!(
                 lease_id,
@@ -288,14 +294,24 @@ impl Worker {
             );
             return;
         }
-        let job = job.unwrap_or_default();
-        tracing::info!(lease_id, attempt, job_id = job.job_id, frame = job.frame, "frame started");
+        // A lease of nothing fails as a frame that names nothing.
+        let task = task.unwrap_or_else(|| lease::Task::Frame(FrameJob::default()));
+        match &task {
+            lease::Task::Frame(job) => {
+                tracing::info!(lease_id, attempt, job_id = job.job_id, frame = job.frame, "frame started");
+            }
+            lease::Task::Tracks(job) => {
+                tracing::info!(lease_id, attempt, job_id = job.job_id, view = job.view, "tracks started");
+            }
+        }
         let cancel = CancellationToken::new();
         let (sender, progress) = watch::channel(FrameProgress { stage: "fetch", done: 0, total: 0 });
-        let (runner, blobs, job_cancel) = (self.runner.clone(), blobs.clone(), cancel.clone());
+        let (said, fields) = mpsc::unbounded_channel();
+        let said = Said { progress: sender, fields: said };
+        let (runner, blobs, task_cancel) = (self.runner.clone(), blobs.clone(), cancel.clone());
         let task =
-            tokio::spawn(async move { runner.run(&job, likely_next, &blobs, sender, &job_cancel).await });
-        self.running = Some(RunningLease { lease_id, attempt, progress, cancel, task });
+            tokio::spawn(async move { runner.run(task, likely_next, &blobs, said, &task_cancel).await });
+        self.running = Some(RunningLease { lease_id, attempt, progress, fields, cancel, task });
     }
 
     fn cancel(&self, lease_id: &str, reason: &str) {
@@ -328,14 +344,14 @@ impl Worker {
         let running = self.running.take()?;
         let outcome = outcome?;
         match &outcome {
-            Outcome::Success(_) => tracing::info!(lease_id = running.lease_id, "frame done"),
+            Outcome::Success(_) | Outcome::Tracked(_) => tracing::info!(lease_id = running.lease_id, "done"),
             Outcome::Failure(failure) => {
                 self.is_device_in_doubt = true;
                 tracing::warn!(
                     lease_id = running.lease_id,
                     kind = failure.kind().as_str_name(),
                     failure.message,
-                    "frame failed"
+                    "failed"
                 );
             }
         }
@@ -375,7 +391,7 @@ impl Worker {
         })
     }
 
-    /// Says goodbye and stops the running frame.
+    /// Says goodbye and stops the running task.
     async fn stop(&mut self, connection: Option<Connection>) -> Exit {
         if let Some(connection) = connection {
             let reason = "the worker was asked to stop".to_owned();
@@ -397,16 +413,30 @@ impl Worker {
     }
 }
 
-/// The outcome of the running lease; never ready without one.
-async fn finished(running: &mut Option<RunningLease>) -> Option<Outcome> {
+/// What becomes of the running lease.
+enum Step {
+    /// A track field is stored.
+    Field(FieldReport),
+    /// The task has ended; without an outcome it was cancelled.
+    Ended(Option<Outcome>),
+}
+
+/// The next step of the running lease; never ready without one. Fields that are not yet said when the task ends are in
+/// its outcome.
+async fn next_step(running: &mut Option<RunningLease>) -> Step {
     let Some(running) = running else { return pending().await };
-    match (&mut running.task).await {
-        Ok(outcome) => outcome,
-        Err(error) => Some(Outcome::Failure(Failure {
-            kind: FailureKind::Bug.into(),
-            message: format!("the frame job's task: {error}"),
-        })),
-    }
+    let ended = tokio::select! {
+        biased;
+        ended = &mut running.task => ended,
+        Some(field) = running.fields.recv() => {
+            let (lease_id, attempt) = (running.lease_id.clone(), running.attempt);
+            return Step::Field(FieldReport { lease_id, attempt, field: Some(field) });
+        }
+    };
+    Step::Ended(ended.unwrap_or_else(|error| {
+        let message = format!("the worker's task: {error}");
+        Some(Outcome::Failure(Failure { kind: FailureKind::Bug.into(), message }))
+    }))
 }
 
 fn heartbeat_period(milliseconds: u32) -> Duration {

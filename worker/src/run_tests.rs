@@ -90,7 +90,7 @@ async fn wait_on(receiver: Receiver<()>) {
 fn failure(report: Report) -> (FailureKind, String) {
     match report.outcome.unwrap() {
         report::Outcome::Failure(failure) => (failure.kind(), failure.message),
-        report::Outcome::Success(success) => panic!("a failure, not {success:?}"),
+        other => panic!("a failure, not {other:?}"),
     }
 }
 

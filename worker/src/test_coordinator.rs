@@ -121,7 +121,8 @@ impl Session {
     }
 
     pub(crate) async fn lease(&self, lease_id: &str, job: FrameJob) {
-        let lease = Lease { lease_id: lease_id.into(), attempt: 1, job: Some(job), likely_next: None };
+        let task = Some(v1::lease::Task::Frame(job));
+        let lease = Lease { lease_id: lease_id.into(), attempt: 1, task, likely_next: None };
         self.send(coordinator_message::Message::Lease(lease)).await;
     }
 

@@ -14,7 +14,7 @@ use crate::{
     follow::follow,
     interrupt,
     logs::LogArgs,
-    outcome::{Outcome, frame_state_label, job_state_label},
+    outcome::{Outcome, job_state_label, task_state_label},
     stdout, table,
 };
 
@@ -92,16 +92,25 @@ fn to_json(event: &JobEvent) -> Value {
         }
         Some(Event::FrameState(change)) => json!({ "frame_state": {
             "frame": change.frame,
-            "state": frame_state_label(change.state()),
+            "state": task_state_label(change.state()),
             "attempt": change.attempt,
             "worker_id": change.worker_id,
             "failure": reason(&change.failure),
             "seconds": change.seconds,
             "report": serde_json::from_str::<Value>(&change.report_json).unwrap_or(Value::Null),
         } }),
+        Some(Event::TracksState(change)) => json!({ "tracks_state": {
+            "view": change.view,
+            "state": task_state_label(change.state()),
+            "attempt": change.attempt,
+            "worker_id": change.worker_id,
+            "failure": reason(&change.failure),
+            "seconds": change.seconds,
+        } }),
         Some(Event::Progress(progress)) => json!({ "progress": {
             "stage": progress.stage,
             "frame": progress.frame,
+            "view": progress.view,
             "done": progress.done,
             "total": progress.total,
             "worker_id": progress.worker_id,
@@ -117,14 +126,14 @@ fn to_json(event: &JobEvent) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use trackersplat_proto::v1::FrameState;
+    use trackersplat_proto::v1::TaskState;
 
     use super::*;
     use crate::outcome::tests::frame_event;
 
     #[test]
     fn an_event_is_one_line_that_a_script_can_read() {
-        let text = to_json(&frame_event(7, 3, FrameState::Done)).to_string();
+        let text = to_json(&frame_event(7, 3, TaskState::Done)).to_string();
         assert_eq!(text.lines().count(), 1);
         let value: Value = serde_json::from_str(&text).expect("JSON");
         assert_eq!(value["sequence"], 7);

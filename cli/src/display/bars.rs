@@ -3,20 +3,21 @@
 use std::{collections::BTreeMap, time::Duration};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use trackersplat_proto::v1::{FrameState, JobEvent, JobState, Progress, job_event::Event};
+use trackersplat_proto::v1::{Failure, JobEvent, JobState, Progress, TaskState, job_event::Event};
 
 use super::{Display, no_worker_text};
 use crate::outcome::{Outcome, job_state_label};
 
 const REDRAW: Duration = Duration::from_millis(200);
 
-/// One bar for the job's stage, one for its frames, one per frame that is being computed.
+/// One bar for the job's stage, one for its frames, one per frame and per view that a worker is at.
 pub(super) struct Bars {
     coordinator: String,
     all: MultiProgress,
     stage: ProgressBar,
     frames: ProgressBar,
-    running: BTreeMap<u32, ProgressBar>,
+    running: BTreeMap<String, ProgressBar>,
+    /// Whether the stage bar is of frames: handing them out is over before anybody could read it.
     are_frames_running: bool,
 }
 
@@ -39,22 +40,49 @@ impl Bars {
     }
 
     fn progress(&mut self, progress: &Progress) {
-        if progress.frame == 0 {
-            // Handing frames out is over before anybody could read it.
-            if self.are_frames_running {
-                return;
-            }
-            advance(&self.stage, "{spinner}", progress.done, progress.total);
-            return;
-        }
-        let bar = self.running.entry(progress.frame).or_insert_with(|| {
+        let task = match (progress.frame, progress.view.as_str()) {
+            (0, "") if self.are_frames_running => return,
+            (0, "") => return advance(&self.stage, "{spinner}", progress.done, progress.total),
+            (0, view) => view_label(view),
+            (frame, _) => frame_label(frame),
+        };
+        let bar = self.running.entry(task).or_insert_with_key(|task| {
             let bar = self.all.add(ProgressBar::new(0));
-            bar.set_prefix(format!("frame {}", progress.frame));
+            bar.set_prefix(task.clone());
             bar
         });
         advance(bar, " ", progress.done, progress.total);
         bar.set_message(format!("{} on {}", progress.stage, progress.worker_id));
     }
+}
+
+impl Bars {
+    /// A frame or a view has changed its state: nobody is at it any more, unless it was leased.
+    fn task(
+        &mut self,
+        task: &str,
+        state: TaskState,
+        failure: Option<&Failure>,
+        (attempt, worker): (u32, &str),
+    ) {
+        if state != TaskState::Leased
+            && let Some(bar) = self.running.remove(task)
+        {
+            bar.finish_and_clear();
+            self.all.remove(&bar);
+        }
+        if let Some(failure) = failure {
+            self.note(&format!("{task} (attempt {attempt}, {worker}): {}", failure.message));
+        }
+    }
+}
+
+fn frame_label(frame: u32) -> String {
+    format!("frame {frame}")
+}
+
+fn view_label(view: &str) -> String {
+    format!("tracks {view}")
 }
 
 impl Display for Bars {
@@ -70,22 +98,26 @@ impl Display for Bars {
                 }
             }
             Some(Event::FrameState(change)) => {
-                if change.state() != FrameState::Leased
-                    && let Some(bar) = self.running.remove(&change.frame)
-                {
-                    bar.finish_and_clear();
-                    self.all.remove(&bar);
-                }
-                if let Some(failure) = &change.failure {
-                    self.note(&format!(
-                        "frame {} (attempt {}, {}): {}",
-                        change.frame, change.attempt, change.worker_id, failure.message
-                    ));
-                }
-                let done = outcome.frames_in(FrameState::Done).len();
+                let task = frame_label(change.frame);
+                self.task(
+                    &task,
+                    change.state(),
+                    change.failure.as_ref(),
+                    (change.attempt, &change.worker_id),
+                );
+                let done = outcome.frames_in(TaskState::Done).len();
                 self.frames.set_style(style("  {prefix:<14} {bar:30} {pos}/{len}"));
                 self.frames.set_length(outcome.frames.len() as u64);
                 self.frames.set_position(done as u64);
+            }
+            Some(Event::TracksState(change)) => {
+                let task = view_label(&change.view);
+                self.task(
+                    &task,
+                    change.state(),
+                    change.failure.as_ref(),
+                    (change.attempt, &change.worker_id),
+                );
             }
             Some(Event::Progress(progress)) => self.progress(progress),
             Some(Event::Workers(workers)) => {

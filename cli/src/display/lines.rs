@@ -3,7 +3,7 @@
 use trackersplat_proto::v1::{JobEvent, job_event::Event};
 
 use super::{Display, no_worker_text};
-use crate::outcome::{Outcome, frame_state_label, job_state_label};
+use crate::outcome::{Outcome, job_state_label, task_state_label};
 
 /// A line per change; progress in between at debug level.
 pub(super) struct Lines {
@@ -26,7 +26,7 @@ impl Display for Lines {
                 None => tracing::info!(state = job_state_label(change.state()), "job"),
             },
             Some(Event::FrameState(change)) => {
-                let state = frame_state_label(change.state());
+                let state = task_state_label(change.state());
                 let (frame, attempt, worker) = (change.frame, change.attempt, change.worker_id.as_str());
                 match &change.failure {
                     Some(failure) => {
@@ -35,9 +35,23 @@ impl Display for Lines {
                     None => tracing::info!(frame, state, attempt, worker, "frame"),
                 }
             }
+            Some(Event::TracksState(change)) => {
+                let state = task_state_label(change.state());
+                let (view, attempt, worker) = (&change.view, change.attempt, change.worker_id.as_str());
+                match &change.failure {
+                    Some(failure) => {
+                        tracing::warn!(view, state, attempt, worker, reason = failure.message, "tracks");
+                    }
+                    None => tracing::info!(view, state, attempt, worker, "tracks"),
+                }
+            }
             Some(Event::Progress(progress)) => {
                 let (stage, done, total) = (progress.stage.as_str(), progress.done, progress.total);
-                tracing::debug!(stage, frame = progress.frame, done, total, "progress");
+                if progress.view.is_empty() {
+                    tracing::debug!(stage, frame = progress.frame, done, total, "progress");
+                } else {
+                    tracing::debug!(stage, view = progress.view, done, total, "progress");
+                }
             }
             Some(Event::Workers(workers)) => {
                 tracing::info!(

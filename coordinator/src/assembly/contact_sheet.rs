@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use splat::{formats::ply, image::Image};
 
 use super::{AssembledFrame, AssembledView, AssemblyError, AssemblyInput, font, frame_path};
-use crate::queue::frame::FrameState;
+use crate::queue::task::TaskState;
 
 /// Rows of the sheet.
 const MAX_FRAMES: usize = 5;
@@ -21,7 +21,7 @@ const INK: [f32; 3] = [0.92; 3];
 pub(super) fn draw(input: &AssemblyInput<'_>) -> Result<Option<Image>, AssemblyError> {
     let Some(view) = input.views.iter().find(|view| view.held_out) else { return Ok(None) };
     let done: Vec<&AssembledFrame> =
-        input.frames.iter().filter(|frame| frame.state == FrameState::Done).collect();
+        input.frames.iter().filter(|frame| frame.state == TaskState::Done).collect();
     let mut rows = Vec::new();
     for index in spread(done.len(), MAX_FRAMES) {
         let frame = done[index];

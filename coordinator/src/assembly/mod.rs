@@ -36,7 +36,7 @@ use splat::{
 
 use self::files::write_atomically;
 pub use self::files::{delta_path, frame_path, holds_results};
-use crate::queue::frame::FrameState;
+use crate::queue::task::TaskState;
 
 /// The key frame's file in the output folder.
 pub const STATIC_MODEL: &str = "static.ply";
@@ -81,7 +81,7 @@ pub struct AssembledFrame {
     /// Frame number.
     pub number: u32,
     /// Done, failed or cancelled.
-    pub state: FrameState,
+    pub state: TaskState,
     /// Leases given.
     pub attempts: u32,
     /// Worker of the last attempt.

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use splat::{cameras::Camera, clip::Split, formats::ply, frame::FrameReport, settings::Settings};
 
 use super::{AssembledFrame, AssembledView, AssemblyError, AssemblyInput, SEQUENCE, delta_path, frame_path};
-use crate::queue::frame::FrameState;
+use crate::queue::task::TaskState;
 
 /// Version of the layout of `sequence.json`; it grows when a reader must know of a change.
 pub const SCHEMA_VERSION: u32 = 1;
@@ -182,7 +182,7 @@ impl SequenceView {
 
 impl SequenceFrame {
     fn describe(output: &std::path::Path, frame: &AssembledFrame) -> Result<Self, AssemblyError> {
-        let is_done = frame.state == FrameState::Done;
+        let is_done = frame.state == TaskState::Done;
         let file = |path| if is_done { file_of(output, path).map(Some) } else { Ok(None) };
         Ok(Self {
             number: frame.number,
@@ -199,7 +199,7 @@ impl SequenceFrame {
 
     /// Whether its Gaussians are there.
     pub fn is_done(&self) -> bool {
-        self.state == FrameState::Done.label()
+        self.state == TaskState::Done.label()
     }
 }
 

@@ -80,7 +80,7 @@ fn metrics(view: &str, psnr: f64, moving_psnr: Option<f64>) -> ViewMetrics {
 fn done_frame(number: u32) -> AssembledFrame {
     AssembledFrame {
         number,
-        state: FrameState::Done,
+        state: TaskState::Done,
         attempts: 2,
         worker: "worker-a".into(),
         report: Some(FrameReport {
@@ -95,7 +95,7 @@ fn done_frame(number: u32) -> AssembledFrame {
 }
 
 fn failed_frame(number: u32) -> AssembledFrame {
-    AssembledFrame { state: FrameState::Failed, report: None, delta: None, ..done_frame(number) }
+    AssembledFrame { state: TaskState::Failed, report: None, delta: None, ..done_frame(number) }
 }
 
 fn grey_truth(_view: &str, _frame: u32) -> Option<Image> {

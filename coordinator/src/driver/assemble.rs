@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, path::PathBuf, sync::Arc};
 
-use splat::{image::Image, settings::MotionSource};
+use splat::image::Image;
 use trackersplat_proto::v1::{Blob, FailureKind};
 
 use super::Job;
@@ -12,7 +12,7 @@ use crate::{
     },
     failure::StageError,
     hub::{FrameBase, Hub},
-    queue::frame::FrameState,
+    queue::{Task, task::TaskState},
     store::{FrameRecord, ViewRecord},
 };
 
@@ -74,7 +74,7 @@ impl Job {
     async fn parts(&self, records: &[FrameRecord]) -> Result<Parts, StageError> {
         let base = self.load_base().await?;
         let views = self.views().await?;
-        let (mut image_bytes, mut track_bytes, mut delta_bytes) = (0, 0, 0);
+        let (mut image_bytes, mut delta_bytes) = (0, 0);
         let mut test_images = BTreeMap::new();
         for &frame in &self.frames {
             for record in self.hub.store.images(&self.id, frame).await? {
@@ -84,11 +84,7 @@ impl Job {
                 }
             }
         }
-        let tracked = self.settings.motion_source == MotionSource::Tracks;
-        for (position, view) in views.iter().enumerate().filter(|(_, view)| tracked && !view.held_out) {
-            let tracks = self.tracks_of(position, &view.name).await?.unwrap_or_default();
-            track_bytes += tracks.values().map(|blob| blob.size).sum::<u64>();
-        }
+        let track_bytes = if self.is_tracked() { self.ledger().await?.bytes() } else { 0 };
         let mut frames = Vec::new();
         for record in records {
             let frame = self.assembled(record, &base).await?;
@@ -133,10 +129,10 @@ impl Job {
         Ok(AssembledFrame {
             number: record.frame,
             state: record.state()?,
-            attempts: record.attempts,
-            worker: record.worker.clone(),
+            attempts: record.task.attempts,
+            worker: record.task.worker.clone(),
             report: serde_json::from_str(&record.report).ok(),
-            seconds: record.seconds,
+            seconds: record.task.seconds,
             stage_seconds: record.stage_seconds(),
             delta,
         })
@@ -146,12 +142,12 @@ impl Job {
     async fn failed_frames(&self, records: &[FrameRecord]) -> Result<(), StageError> {
         let mut failed = Vec::new();
         for record in records {
-            if record.state()? == FrameState::Failed {
+            if record.state()? == TaskState::Failed {
                 failed.push(record.frame);
             }
         }
         let Some(&first) = failed.first() else { return Ok(()) };
-        let why = self.hub.store.last_failure(&self.id, first).await?;
+        let why = self.hub.store.last_failure(&self.id, Task::Frame(first)).await?;
         let (kind, reason) =
             why.unwrap_or((FailureKind::OutOfResources, "no worker has the memory for it".into()));
         let message = format!(

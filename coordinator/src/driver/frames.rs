@@ -2,10 +2,7 @@
 
 use std::{collections::BTreeMap, sync::Arc};
 
-use splat::{
-    formats::ply,
-    settings::{MotionSource, Settings},
-};
+use splat::{formats::ply, settings::Settings};
 use trackersplat_proto::v1::{Blob, FailureKind, FrameJob, FrameView};
 
 use super::{Job, progress::StageProgress};
@@ -17,33 +14,65 @@ use crate::{
     store::{Artifact, CommittedFrame, ViewRecord},
 };
 
+/// What every frame job of a job is made of.
+pub(super) struct FrameWork {
+    base: Arc<FrameBase>,
+    views: Vec<ViewRecord>,
+}
+
 impl Job {
+    /// Publishes the frames that were not when they were tracked, and waits for all.
     pub(super) async fn compute_frames(&mut self) -> Result<(), StageError> {
-        let base = self.load_base().await?;
-        self.hub.set_frame_base(&self.id, base.clone()).await;
-        let views = self.views().await?;
-        let tracks = self.all_tracks(&views).await?;
-        let progress = StageProgress::new(self, "publish");
-        for &frame in &self.frames {
-            let request = self.frame_job(frame, &base.blob, &views, &tracks).await?;
-            let key = frame_key(&request, &self.settings);
-            let is_done = self.is_done(frame).await?;
-            match self.held_artifact(&key).await? {
-                Some(known) if !is_done => self.reuse(&base, &request, &key, &known).await?,
-                _ => self.hub.publish(&self.id, &self.stop, &request, &key).await?,
+        if self.published < self.frames.len() {
+            let work = self.frame_work().await?;
+            let ledger = if self.is_tracked() { Some(self.ledger().await?) } else { None };
+            let progress = StageProgress::new(self, "publish");
+            for &frame in &self.frames[self.published..] {
+                let tracks = match &ledger {
+                    Some(ledger) => ledger.at(frame).ok_or_else(|| tracks_gone(frame))?,
+                    None => BTreeMap::new(),
+                };
+                self.publish_frame(&work, frame, &tracks).await?;
+                let _ = progress.advance(self.frames.len() as u64);
             }
-            let _ = progress.advance(self.frames.len() as u64);
         }
         self.frames_ended().await
     }
 
+    /// From now on results of frames can be verified.
+    pub(super) async fn frame_work(&self) -> Result<FrameWork, StageError> {
+        let base = self.load_base().await?;
+        self.hub.set_frame_base(&self.id, base.clone()).await;
+        Ok(FrameWork { base, views: self.views().await? })
+    }
+
+    /// Makes a frame ready for workers, or done if its result was computed before. `tracks` by position of the view.
+    pub(super) async fn publish_frame(
+        &self,
+        work: &FrameWork,
+        frame: u32,
+        tracks: &BTreeMap<u32, Blob>,
+    ) -> Result<(), StageError> {
+        let request = self.frame_job(frame, work, tracks).await?;
+        let key = frame_key(&request, &self.settings);
+        let is_done = self.is_done(frame).await?;
+        match self.held_artifact(&key).await? {
+            Some(known) if !is_done => self.reuse(&work.base, &request, &key, &known).await,
+            _ => self.hub.publish(&self.id, &self.stop, &request, &key).await,
+        }
+    }
+
     /// Waits until every frame is done or has failed.
     async fn frames_ended(&self) -> Result<(), StageError> {
-        while self.hub.open_frames(&self.id).await > 0 {
-            let ended = self.stop.run_until_cancelled(self.frame_ended.notified()).await;
-            ended.ok_or(StageError::Stopped)?;
+        let mut changed = self.changed.clone();
+        loop {
+            changed.borrow_and_update();
+            if self.hub.open_tasks(&self.id).await == 0 {
+                return Ok(());
+            }
+            let woken = self.stop.run_until_cancelled(changed.changed()).await;
+            woken.and_then(Result::ok).ok_or(StageError::Stopped)?;
         }
-        Ok(())
     }
 
     /// Whether a frame has its result. A result whose bytes are gone is given up.
@@ -76,49 +105,30 @@ impl Job {
         Ok(Arc::new(FrameBase { model, blob, digest, output: record.output.into() }))
     }
 
-    /// Tracks by view position and frame number; empty where the motion is not tracked.
-    async fn all_tracks(&self, views: &[ViewRecord]) -> Result<Vec<BTreeMap<u32, Blob>>, StageError> {
-        let mut tracks = vec![BTreeMap::new(); views.len()];
-        if self.settings.motion_source == MotionSource::None {
-            return Ok(tracks);
-        }
-        for (position, view) in views.iter().enumerate().filter(|(_, view)| !view.held_out) {
-            tracks[position] = self.tracks_of(position, &view.name).await?.ok_or_else(|| {
-                let message =
-                    format!("the stored tracks of view '{}' are gone; submit the job again", view.name);
-                StageError::new(FailureKind::Transient, message)
-            })?;
-        }
-        Ok(tracks)
-    }
-
     async fn frame_job(
         &self,
         frame: u32,
-        static_model: &Blob,
-        views: &[ViewRecord],
-        tracks: &[BTreeMap<u32, Blob>],
+        work: &FrameWork,
+        tracks: &BTreeMap<u32, Blob>,
     ) -> Result<FrameJob, StageError> {
         let images = self.hub.store.images(&self.id, frame).await?;
         let mut job = FrameJob {
             job_id: self.id.to_string(),
             frame,
             settings_json: settings_json(&self.settings)?,
-            static_model: Some(static_model.clone()),
+            static_model: Some(work.base.blob.clone()),
             key_frame: frame == self.key_frame(),
             ..FrameJob::default()
         };
         for record in images {
-            let (Some(view), Some(view_tracks)) = (views.get(record.position), tracks.get(record.position))
-            else {
-                continue;
-            };
+            let Some(view) = work.views.get(record.position) else { continue };
+            let position = u32::try_from(record.position).unwrap_or(u32::MAX);
             let frame_view = FrameView {
                 name: view.name.clone(),
                 camera: Some(camera_to_wire(&view.camera)),
                 image: Some(record.image),
                 mask: record.mask,
-                tracks: view_tracks.get(&frame).cloned(),
+                tracks: tracks.get(&position).cloned(),
             };
             if view.held_out { job.test_views.push(frame_view) } else { job.training_views.push(frame_view) }
         }
@@ -143,6 +153,11 @@ impl Job {
         };
         self.hub.reuse(&self.id, &self.stop, request, key, &result).await
     }
+}
+
+fn tracks_gone(frame: u32) -> StageError {
+    let message = format!("the stored tracks to frame {frame} are gone; submit the job again");
+    StageError::new(FailureKind::Transient, message)
 }
 
 fn settings_json(settings: &Settings) -> Result<String, StageError> {

@@ -3,8 +3,10 @@
 //! Every stage asks the store first what is there already, so that going on after a restart, after a resubmission, and
 //! starting afresh are the same code.
 
+mod alone;
 mod assemble;
 mod frames;
+mod imported;
 mod ingest;
 mod progress;
 mod static_model;
@@ -16,7 +18,7 @@ use splat::{
     clip::{Clip, ClipOptions},
     settings::Settings,
 };
-use tokio::sync::Notify;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::FailureKind;
 
@@ -34,11 +36,14 @@ struct Job {
     hub: Arc<Hub>,
     id: JobId,
     stop: CancellationToken,
-    frame_ended: Arc<Notify>,
+    /// Marked when something happens to the job's tasks or the workers.
+    changed: watch::Receiver<()>,
     record: JobRecord,
     settings: Arc<Settings>,
     request: JobRequest,
     frames: Vec<u32>,
+    /// How many of the frames were published in this run, in order.
+    published: usize,
     clip: Option<Arc<Clip>>,
 }
 
@@ -47,10 +52,10 @@ pub(crate) async fn run(
     hub: Arc<Hub>,
     id: JobId,
     stop: CancellationToken,
-    frame_ended: Arc<Notify>,
+    changed: watch::Receiver<()>,
     clip: Option<Arc<Clip>>,
 ) {
-    if let Err(error) = run_stages(&hub, &id, stop, frame_ended, clip).await {
+    if let Err(error) = run_stages(&hub, &id, stop, changed, clip).await {
         hub.fail(error);
     }
 }
@@ -59,10 +64,10 @@ async fn run_stages(
     hub: &Arc<Hub>,
     id: &JobId,
     stop: CancellationToken,
-    frame_ended: Arc<Notify>,
+    changed: watch::Receiver<()>,
     clip: Option<Arc<Clip>>,
 ) -> Result<(), StoreError> {
-    let ended = match Job::load(hub.clone(), id.clone(), stop.clone(), frame_ended, clip).await {
+    let ended = match Job::load(hub.clone(), id.clone(), stop.clone(), changed, clip).await {
         Ok(mut job) => {
             let ended = job.run_to_end().await;
             ended.map_err(|error| job.named_by_url(error))
@@ -86,7 +91,7 @@ impl Job {
         hub: Arc<Hub>,
         id: JobId,
         stop: CancellationToken,
-        frame_ended: Arc<Notify>,
+        changed: watch::Receiver<()>,
         clip: Option<Arc<Clip>>,
     ) -> Result<Self, StageError> {
         let record = hub.store.job(&id).await?.ok_or(StageError::Stopped)?;
@@ -97,7 +102,18 @@ impl Job {
             serde_json::from_str(&record.settings).map_err(|error| wrong("jobs.settings", error))?;
         let request = serde_json::from_str(&record.request).map_err(|error| wrong("jobs.request", error))?;
         let frames = record.frame_numbers()?;
-        Ok(Self { hub, id, stop, frame_ended, record, settings: Arc::new(settings), request, frames, clip })
+        Ok(Self {
+            hub,
+            id,
+            stop,
+            changed,
+            record,
+            settings: Arc::new(settings),
+            request,
+            frames,
+            published: 0,
+            clip,
+        })
     }
 
     async fn run_to_end(&mut self) -> Result<(), StageError> {

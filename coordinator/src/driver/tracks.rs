@@ -1,363 +1,141 @@
-//! Track fields from the key frame to every frame, per training view: computed, or imported. Once per clip.
+//! Track fields from the key frame to every frame, per training view. Once per clip.
+//!
+//! Own tracks are tasks like frames: workers take them view by view, and the coordinator where no worker may. A frame is
+//! published as soon as every view is tracked to it, so that it is refined while later ones are tracked.
 
-use std::{collections::BTreeMap, path::Path, sync::Arc};
+use std::collections::BTreeMap;
 
-use bytes::Bytes;
-use rayon::prelude::*;
-use splat::{
-    clip::{Clip, Split},
-    formats::{track_blob, track_npz},
-    settings::{MotionSource, Settings},
-    tracking::{TrackField, track_view},
-};
-use tokio::sync::mpsc;
-use trackersplat_proto::v1::{Blob, FailureKind};
+use splat::settings::MotionSource;
+use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
-use super::{Job, progress::StageProgress};
+use super::Job;
 use crate::{
-    compute::go_on,
     failure::StageError,
     keys::{TrackKey, VERSION, digest_of},
+    ledger::{Field, TrackLedger, TrackedView},
+    model,
     request::{InputFile, TrackSource},
-    store::Artifact,
+    store::{Artifact, ViewRecord},
 };
-
-/// Encoded fields that may wait to be stored.
-const PENDING_FIELDS: usize = 4;
-
-/// A view whose tracks are missing.
-#[derive(Clone, Debug)]
-struct MissingView {
-    /// Position in the clip.
-    position: usize,
-    name: String,
-    size: (u32, u32),
-    /// The file to import, as submitted; `None`: track.
-    file: Option<InputFile>,
-}
-
-/// An encoded field on its way to the store: position of the view, index of the frame.
-type EncodedField = (usize, usize, Bytes);
 
 impl Job {
     pub(super) async fn track(&mut self) -> Result<(), StageError> {
-        if self.settings.motion_source == MotionSource::None || self.frames.len() < 2 {
+        if !self.is_tracked() || self.frames.len() < 2 {
             return Ok(());
         }
-        let clip = self.clip().await?;
-        let missing = self.missing_views(&clip).await?;
-        if missing.is_empty() {
-            tracing::info!(job_id = %self.id, "tracks reused");
-            return Ok(());
+        match self.request.tracks {
+            TrackSource::Own | TrackSource::Learned(_) => self.compute_tracks().await,
+            TrackSource::Exact(_) | TrackSource::Files(_) => self.import_tracks().await,
         }
-        let _turn = self.turn().await?;
-        let (fields, mut incoming) = mpsc::channel::<EncodedField>(PENDING_FIELDS);
-        let total = (missing.len() * (self.frames.len() - 1)) as u64;
-        let source = TrackRun {
-            clip,
-            frames: self.frames.clone(),
-            settings: self.settings.clone(),
-            progress: StageProgress::new(self, "tracking"),
-            total,
-            fields,
-        };
-        let work = self.hub.compute.run(move || missing.par_iter().try_for_each(|view| source.run(view)));
-        let store = async {
-            let mut stored = Ok(());
-            while let Some((position, index, bytes)) = incoming.recv().await {
-                stored = self.keep_tracks(position, index, bytes).await;
-                if stored.is_err() {
-                    // The computation ends at its next field.
-                    incoming.close();
-                    break;
+    }
+
+    /// Whether the frames of this job start from tracks.
+    pub(super) fn is_tracked(&self) -> bool {
+        self.settings.motion_source == MotionSource::Tracks
+    }
+
+    async fn compute_tracks(&mut self) -> Result<(), StageError> {
+        let work = self.frame_work().await?;
+        let ledger = self.ledger().await?;
+        self.hub.begin_tracks(&self.id, &self.stop, ledger).await?;
+        tokio::try_join!(self.publish_tracked(&work), self.track_alone())?;
+        self.published = self.frames.len();
+        Ok(())
+    }
+
+    /// Publishes every frame, in order, once all views are tracked to it.
+    async fn publish_tracked(&self, work: &super::frames::FrameWork) -> Result<(), StageError> {
+        let mut changed = self.changed.clone();
+        for &frame in &self.frames {
+            let tracks = loop {
+                changed.borrow_and_update();
+                if let Some(tracks) = self.hub.tracks(&self.id, |ledger| ledger.at(frame)).await? {
+                    break tracks;
                 }
-            }
-            stored
-        };
-        let (computed, stored) = tokio::join!(work, store);
-        stored?;
-        computed?;
-        go_on(&self.stop)
-    }
-
-    async fn keep_tracks(&self, position: usize, index: usize, bytes: Bytes) -> Result<(), StageError> {
-        let views = self.views().await?;
-        let view = views.get(position).ok_or_else(|| {
-            StageError::new(FailureKind::Bug, format!("view {position} is none of the job's {}", views.len()))
-        })?;
-        let key = self.track_key(position, &view.name, index)?;
-        let artifact = Artifact { blob: self.hub.blobs.put(bytes).await?, note: String::new() };
-        let mut change = self.hub.store.change().await?;
-        change.put_artifact(&key, "tracks", &artifact).await?;
-        Ok(change.commit().await?)
-    }
-
-    /// Key of the tracks of one view to the frame of an index.
-    fn track_key(&self, position: usize, view: &str, index: usize) -> Result<String, StageError> {
-        let settings;
-        let source = match &self.request.tracks {
-            TrackSource::Own => {
-                settings = digest_of(&self.settings.tracking);
-                settings.as_str()
-            }
-            TrackSource::Exact(_) | TrackSource::Files(_) => self.track_file(position, view)?.digest.as_str(),
-        };
-        let clip = &self.record.clip_digest;
-        let frames = &self.frames[..=index];
-        Ok(digest_of(&TrackKey { kind: "tracks", version: VERSION, source, clip, frames, view }))
-    }
-
-    /// The imported file of a training view: by name where every file is named after a view, else by order, as are those
-    /// of the clip.
-    fn track_file(&self, position: usize, view: &str) -> Result<&InputFile, StageError> {
-        let (TrackSource::Files(files) | TrackSource::Exact(files)) = &self.request.tracks else {
-            return Err(StageError::new(FailureKind::Bug, "the job imports no tracks"));
-        };
-        let found = match self.request.track_files_by_name {
-            true => files.iter().find(|file| file.stem() == view),
-            false => {
-                let rank = self.request.training_positions.iter().position(|&known| known == position);
-                rank.and_then(|rank| files.get(rank))
-            }
-        };
-        found.ok_or_else(|| {
-            StageError::bad_input(format!(
-                "no track file for the training view '{view}' among {} files; give one npz per training view, in view \
-                 order or named after the views",
-                files.len()
-            ))
-        })
-    }
-
-    async fn missing_views(&self, clip: &Clip) -> Result<Vec<MissingView>, StageError> {
-        let mut missing = Vec::new();
-        for (position, view) in clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train)
-        {
-            let file = match &self.request.tracks {
-                TrackSource::Own => None,
-                TrackSource::Exact(_) | TrackSource::Files(_) => {
-                    Some(self.track_file(position, &view.name)?.clone())
-                }
+                let woken = self.stop.run_until_cancelled(changed.changed()).await;
+                woken.and_then(Result::ok).ok_or(StageError::Stopped)?;
             };
-            if self.tracks_of(position, &view.name).await?.is_none() {
-                let size = (view.camera.width, view.camera.height);
-                missing.push(MissingView { position, name: view.name.clone(), size, file });
-            }
-        }
-        Ok(missing)
-    }
-
-    /// The stored tracks of a training view by frame number; `None` if any is missing.
-    pub(super) async fn tracks_of(
-        &self,
-        position: usize,
-        view: &str,
-    ) -> Result<Option<BTreeMap<u32, Blob>>, StageError> {
-        let mut tracks = BTreeMap::new();
-        for (index, &frame) in self.frames.iter().enumerate().skip(1) {
-            let key = self.track_key(position, view, index)?;
-            let Some(artifact) = self.held_artifact(&key).await? else { return Ok(None) };
-            tracks.insert(frame, artifact.blob);
-        }
-        Ok(Some(tracks))
-    }
-}
-
-/// One run over views whose tracks are missing.
-struct TrackRun {
-    clip: Arc<Clip>,
-    frames: Vec<u32>,
-    settings: Arc<Settings>,
-    progress: StageProgress,
-    total: u64,
-    fields: mpsc::Sender<EncodedField>,
-}
-
-impl TrackRun {
-    fn run(&self, view: &MissingView) -> Result<(), StageError> {
-        let Some(file) = &view.file else { return self.track(view) };
-        let path = Path::new(&file.path);
-        let is_exact = path == self.clip.exact_flow_path(view.position);
-        let read = if is_exact { track_npz::read_exact_flow(path) } else { track_npz::read_track_npz(path) };
-        // After reading: what was read is what is kept under the key of the submitted file.
-        check_unchanged(view, file)?;
-        let fields = read.map_err(|error| bad_tracks(view, error))?;
-        let fields = match is_exact {
-            true => exact_fields(view, &self.frames, fields)?,
-            false => imported_fields(view, self.frames.len(), fields)?,
-        };
-        for (index, field) in (1..).zip(fields) {
-            self.emit(view, index, &field)?;
+            self.publish_frame(work, frame, &tracks).await?;
         }
         Ok(())
     }
 
-    fn track(&self, view: &MissingView) -> Result<(), StageError> {
-        let mut load = |index: usize| {
-            let image = self.clip.image(view.position, index);
-            image.map_err(|error| StageError::bad_input(error.to_string()))
+    /// What is to be tracked, and what is in the store already.
+    pub(super) async fn ledger(&self) -> Result<TrackLedger, StageError> {
+        let settings_json = serde_json::to_string(&self.settings.tracking).map_err(|error| {
+            StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
+        })?;
+        let (tracker, tracker_key) = match &self.request.tracks {
+            TrackSource::Learned(file) => {
+                let key = digest_of(&(&settings_json, &file.digest));
+                let model = Some(self.model_blob(file).await?);
+                (Tracker { settings_json, model, model_name: file.name().to_owned() }, key)
+            }
+            TrackSource::Own | TrackSource::Exact(_) | TrackSource::Files(_) => {
+                (Tracker { settings_json: settings_json.clone(), ..Tracker::default() }, settings_json)
+            }
         };
-        let mut emit = |index: usize, field: TrackField| self.emit(view, index, &field);
-        track_view(self.frames.len(), &mut load, &self.settings.tracking, &mut emit)
-    }
-
-    /// Runs on a thread of the compute pool: waiting for the store is how the store slows the tracker down.
-    fn emit(&self, view: &MissingView, index: usize, field: &TrackField) -> Result<(), StageError> {
-        let encoded = Bytes::from(track_blob::encode(field));
-        self.fields.blocking_send((view.position, index, encoded)).map_err(|_| StageError::Stopped)?;
-        match self.progress.advance(self.total) {
-            std::ops::ControlFlow::Continue(()) => Ok(()),
-            std::ops::ControlFlow::Break(()) => Err(StageError::Stopped),
+        let mut tracked = BTreeMap::new();
+        let views = self.views().await?;
+        for (position, view) in (0..).zip(&views).filter(|(_, view)| !view.held_out) {
+            tracked.insert(position, self.tracked_view(position, view, &tracker_key).await?);
         }
-    }
-}
-
-fn check_unchanged(view: &MissingView, submitted: &InputFile) -> Result<(), StageError> {
-    let now = InputFile::read(Path::new(&submitted.path));
-    let now = now.map_err(|error| bad_tracks(view, format!("{error}; check the path")))?;
-    if now.digest != submitted.digest {
-        let reason = "the file has changed since the job was submitted; submit the job again";
-        return Err(bad_tracks(view, reason));
-    }
-    Ok(())
-}
-
-fn bad_tracks(view: &MissingView, reason: impl std::fmt::Display) -> StageError {
-    let file = view.file.as_ref().map(|file| file.path.as_str()).unwrap_or_default();
-    StageError::bad_input(format!("tracks of view '{}' in {file}: {reason}", view.name))
-}
-
-/// Exact flow leads from the clip's frame 1 to frame `t` at index `t - 2`.
-fn exact_fields(
-    view: &MissingView,
-    frames: &[u32],
-    mut fields: Vec<TrackField>,
-) -> Result<Vec<TrackField>, StageError> {
-    if frames.first() != Some(&1) {
-        let key_frame = frames.first().copied().unwrap_or_default();
-        return Err(bad_tracks(
-            view,
-            format!(
-                "exact tracks start at frame 1, the key frame is {key_frame}; begin with frame 1 or use own tracks"
-            ),
-        ));
-    }
-    let held = fields.len();
-    let last = frames.last().copied().unwrap_or_default() as usize;
-    if held + 1 < last {
-        let reason =
-            format!("it reaches frame {}, the job needs frame {last}; reconstruct fewer frames", held + 1);
-        return Err(bad_tracks(view, reason));
-    }
-    let wanted: Vec<usize> = frames[1..].iter().map(|&frame| frame as usize - 2).collect();
-    let mut index = 0;
-    fields.retain(|_| {
-        index += 1;
-        wanted.binary_search(&(index - 1)).is_ok()
-    });
-    check_size(view, &fields)?;
-    Ok(fields)
-}
-
-/// Imported tracks hold a field for every frame after the key frame, or for more.
-fn imported_fields(
-    view: &MissingView,
-    frames: usize,
-    mut fields: Vec<TrackField>,
-) -> Result<Vec<TrackField>, StageError> {
-    let wanted = frames - 1;
-    if fields.len() < wanted {
-        let reason = format!(
-            "it reaches {} frames beyond the key frame, the job needs {wanted}; reconstruct fewer frames",
-            fields.len()
-        );
-        return Err(bad_tracks(view, reason));
-    }
-    fields.truncate(wanted);
-    check_size(view, &fields)?;
-    Ok(fields)
-}
-
-fn check_size(view: &MissingView, fields: &[TrackField]) -> Result<(), StageError> {
-    let wrong = fields.iter().find(|field| (field.width, field.height) != view.size);
-    wrong.map_or(Ok(()), |field| {
-        Err(bad_tracks(
-            view,
-            format!(
-                "they are of {} x {} pixels, the view of {} x {}; give tracks at the size of the images",
-                field.width, field.height, view.size.0, view.size.1
-            ),
-        ))
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used, reason = "tests")]
-
-    use super::*;
-
-    fn view() -> MissingView {
-        let file = InputFile { path: "flow/cam00.npz".into(), digest: String::new() };
-        MissingView { position: 0, name: "cam00".into(), size: (2, 1), file: Some(file) }
+        Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, tracked))
     }
 
-    fn field(x: f32) -> TrackField {
-        TrackField {
-            width: 2,
-            height: 1,
-            positions: vec![[x, 0.0]; 2],
-            visible: vec![true; 2],
-            sigma: vec![0.1; 2],
+    /// The network in the store, where workers find it.
+    async fn model_blob(&self, file: &InputFile) -> Result<Blob, StageError> {
+        let key = digest_of(&("tracker model", &file.digest));
+        if let Some(held) = self.held_artifact(&key).await? {
+            return Ok(held.blob);
         }
+        let submitted = file.clone();
+        let read = move || model::read_again(&submitted).map_err(StageError::bad_input);
+        let bytes = self.hub.compute.run(read).await?;
+        let artifact = Artifact { blob: self.hub.blobs.put(bytes.into()).await?, note: String::new() };
+        let mut change = self.hub.store.change().await?;
+        change.put_artifact(&key, "tracker model", &artifact).await?;
+        change.commit().await?;
+        Ok(artifact.blob)
     }
 
-    fn refusal(result: Result<Vec<TrackField>, StageError>) -> String {
-        let Err(StageError::Failed(failure)) = result else { panic!("{result:?}") };
-        assert_eq!(failure.kind(), FailureKind::BadInput);
-        assert!(failure.message.contains("cam00") && failure.message.contains("flow/cam00.npz"));
-        failure.message
+    async fn tracked_view(
+        &self,
+        position: u32,
+        view: &ViewRecord,
+        tracker: &str,
+    ) -> Result<TrackedView, StageError> {
+        let images = self.hub.store.images_of_view(&self.id, position).await?;
+        let mut images = images.into_iter();
+        let (_, key_image) = images.next().ok_or_else(|| {
+            let message = format!("the stored images of view '{}' are gone; submit the job again", view.name);
+            StageError::new(FailureKind::Transient, message)
+        })?;
+        let mut fields = Vec::new();
+        let mut own_key = digest_of(&("tracks", VERSION, tracker, &key_image.digest));
+        for (index, (frame, image)) in (1..).zip(images) {
+            let key = match self.request.tracks {
+                TrackSource::Own | TrackSource::Learned(_) => {
+                    // Of the tracker and every image up to here: tracks are chained through them.
+                    own_key = digest_of(&("tracks", VERSION, &own_key, &image.digest));
+                    own_key.clone()
+                }
+                TrackSource::Exact(_) | TrackSource::Files(_) => {
+                    self.imported_key(position as usize, &view.name, index)?
+                }
+            };
+            let tracks: Option<Blob> = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
+            fields.push(Field { frame, image, key, tracks });
+        }
+        let size = (view.camera.width, view.camera.height);
+        Ok(TrackedView { name: view.name.clone(), size, key_image, fields })
     }
 
-    #[test]
-    fn a_track_file_that_has_changed_since_the_submission_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("flow/cam00.npz");
-        std::fs::create_dir(folder.path().join("flow")).unwrap();
-        std::fs::write(&path, b"submitted").unwrap();
-        let submitted = InputFile::read(&path).unwrap();
-        let view = MissingView { file: Some(submitted.clone()), ..view() };
-        check_unchanged(&view, &submitted).unwrap();
-        std::fs::write(&path, b"changed").unwrap();
-        let message = refusal(check_unchanged(&view, &submitted).map(|()| vec![]));
-        assert!(message.contains("has changed"), "{message}");
-        std::fs::remove_file(&path).unwrap();
-        refusal(check_unchanged(&view, &submitted).map(|()| vec![]));
-    }
-
-    #[test]
-    fn exact_flow_is_taken_by_frame_number() {
-        let fields = || vec![field(2.0), field(3.0), field(4.0)];
-        let taken = exact_fields(&view(), &[1, 2, 4], fields()).unwrap();
-        assert_eq!(taken, [field(2.0), field(4.0)]);
-        assert!(refusal(exact_fields(&view(), &[2, 3], fields())).contains("key frame is 2"));
-        assert!(refusal(exact_fields(&view(), &[1, 2, 3, 4, 5], fields())).contains("reaches frame 4"));
-    }
-
-    #[test]
-    fn imported_tracks_may_reach_beyond_the_job_and_must_reach_its_end() {
-        let fields = || vec![field(2.0), field(3.0), field(4.0)];
-        assert_eq!(imported_fields(&view(), 3, fields()).unwrap(), [field(2.0), field(3.0)]);
-        assert_eq!(imported_fields(&view(), 4, fields()).unwrap(), fields());
-        let message = refusal(imported_fields(&view(), 5, fields()));
-        assert!(message.contains("reaches 3") && message.contains("needs 4"), "{message}");
-    }
-
-    #[test]
-    fn tracks_of_another_size_are_refused_by_both_sizes() {
-        let other = MissingView { size: (4, 2), ..view() };
-        let message = refusal(imported_fields(&other, 2, vec![field(2.0)]));
-        assert!(message.contains("2 x 1") && message.contains("4 x 2"), "{message}");
-        refusal(exact_fields(&other, &[1, 2], vec![field(2.0)]));
+    /// Key of the imported tracks of one view to the frame of an index.
+    fn imported_key(&self, position: usize, view: &str, index: usize) -> Result<String, StageError> {
+        let source = self.track_file(position, view)?.digest.as_str();
+        let clip = &self.record.clip_digest;
+        let frames = &self.frames[..=index];
+        Ok(digest_of(&TrackKey { kind: "tracks", version: VERSION, source, clip, frames, view }))
     }
 }

@@ -1,4 +1,4 @@
-//! Frames become ready, fail, and end.
+//! Frames become ready; tasks fail and end.
 
 use std::sync::Arc;
 
@@ -9,10 +9,10 @@ use super::{Desk, FrameBase, Hub};
 use crate::{
     failure::{StageError, failure},
     queue::{
-        FailedLease, FrameHistory, FrameKey, JobId,
-        frame::{FrameState, FrameTrigger},
+        FailedLease, JobId, Lease, Task, TaskHistory, TaskKey,
+        task::{TaskState, TaskTrigger},
     },
-    store::{Artifact, AttemptOutcome, CommittedFrame, FrameEvent, StoreError},
+    store::{Artifact, AttemptOutcome, CommittedFrame, StoreError, TaskEvent},
 };
 
 impl Hub {
@@ -33,16 +33,16 @@ impl Hub {
         }
         change.publish_frame(request, result_key).await?;
         let history = match &known {
-            Some(record) if record.state()? != FrameState::Ready => return Ok(()),
+            Some(record) if record.state()? != TaskState::Ready => return Ok(()),
             Some(record) => record.history()?,
             None => {
-                change.append_ready_event(job, frame).await?;
-                FrameHistory::default()
+                change.append_ready_event(job, Task::Frame(frame)).await?;
+                TaskHistory::default()
             }
         };
         change.commit().await?;
         self.tell_stored(job);
-        desk.queue.add(FrameKey { job: job.clone(), frame }, history);
+        desk.queue.add(TaskKey { job: job.clone(), task: Task::Frame(frame) }, history);
         Ok(self.dispatch(&mut desk).await?)
     }
 
@@ -64,16 +64,16 @@ impl Hub {
         }
         change.publish_frame(request, result_key).await?;
         match &known {
-            Some(record) if record.state()?.after(FrameTrigger::Commit).is_err() => return Ok(()),
+            Some(record) if record.state()?.after(TaskTrigger::Commit).is_err() => return Ok(()),
             Some(_) => {}
-            None => change.append_ready_event(job, frame).await?,
+            None => change.append_ready_event(job, Task::Frame(frame)).await?,
         }
         change.commit_frame(job, frame, result).await?;
         let event =
-            FrameEvent { frame, worker: result.worker, report: result.report, ..FrameEvent::default() };
-        change.append_frame_event(job, FrameState::Done, &event).await?;
+            TaskEvent { worker: result.worker, report: result.report, ..TaskEvent::of(Task::Frame(frame)) };
+        change.append_task_event(job, TaskState::Done, &event).await?;
         change.commit().await?;
-        desk.queue.close_ready(&FrameKey { job: job.clone(), frame });
+        desk.queue.close_ready(&TaskKey { job: job.clone(), task: Task::Frame(frame) });
         tracing::info!(job_id = %job, frame, "frame reused");
         self.tell_stored(job);
         Ok(())
@@ -91,7 +91,7 @@ impl Hub {
         if stop.is_cancelled() {
             return Err(StageError::Stopped);
         }
-        if record.state()?.after(FrameTrigger::Lose).is_err() {
+        if record.state()?.after(TaskTrigger::Lose).is_err() {
             return Ok(());
         }
         let mut change = self.store.change().await?;
@@ -102,9 +102,9 @@ impl Hub {
         Ok(())
     }
 
-    /// Number of frames of a job that are ready or leased.
-    pub(crate) async fn open_frames(&self, job: &JobId) -> usize {
-        self.desk.lock().await.queue.open_frames(job)
+    /// Number of tasks of a job that are ready or leased.
+    pub(crate) async fn open_tasks(&self, job: &JobId) -> usize {
+        self.desk.lock().await.queue.open_tasks(job)
     }
 
     /// Writes a failed attempt, and what follows from it, to the database.
@@ -115,28 +115,30 @@ impl Hub {
         reason: &Failure,
     ) -> Result<(), StoreError> {
         let FailedLease { lease, retried } = failed;
-        let (job, frame, kind) = (&lease.key.job, lease.key.frame, reason.kind());
-        let next = if *retried { FrameState::Ready } else { FrameState::Failed };
+        let (job, task, kind) = (&lease.key.job, lease.key.task, reason.kind());
+        let next = if *retried { TaskState::Ready } else { TaskState::Failed };
         let excluded = (kind == FailureKind::OutOfResources).then_some(lease.worker_id.as_str());
         let mut change = self.store.change().await?;
         change.end_attempt(&lease.id, AttemptOutcome::Failed(kind, &reason.message)).await?;
-        change.count_failure(job, frame, excluded).await?;
-        change.set_frame_state(job, frame, next).await?;
-        let event = FrameEvent {
-            frame,
+        change.count_failure(job, task, excluded).await?;
+        change.set_task_state(job, task, next).await?;
+        let event = TaskEvent {
             attempt: lease.attempt,
             worker: &lease.worker_id,
             failure: Some(reason),
-            ..FrameEvent::default()
+            ..TaskEvent::of(task)
         };
-        change.append_frame_event(job, next, &event).await?;
+        change.append_task_event(job, next, &event).await?;
         change.commit().await?;
         tracing::warn!(
-            job_id = %job, frame, attempt = lease.attempt, worker_id = lease.worker_id,
-            kind = kind.label(), reason = reason.message, retried, "attempt failed"
+            job_id = %job, task = task.kind(), number = task.number(), attempt = lease.attempt,
+            worker_id = lease.worker_id, kind = kind.label(), reason = reason.message, retried, "attempt failed"
         );
         self.tell_stored(job);
-        desk.frame_ended(job);
+        if let (Task::Tracks(position), false) = (task, retried) {
+            desk.tracks_failed(job, position, reason);
+        }
+        desk.changed(job);
         Ok(())
     }
 
@@ -144,10 +146,10 @@ impl Hub {
     pub(super) async fn record_done(
         &self,
         desk: &mut Desk,
-        lease: &crate::queue::Lease,
+        lease: &Lease,
         result: &CommittedFrame<'_>,
     ) -> Result<(), StoreError> {
-        let (job, frame) = (&lease.key.job, lease.key.frame);
+        let (job, task, frame) = (&lease.key.job, lease.key.task, lease.key.task.number());
         let record = self.store.frame(job, frame).await?;
         let mut change = self.store.change().await?;
         change.end_attempt(&lease.id, AttemptOutcome::Done).await?;
@@ -156,22 +158,21 @@ impl Hub {
             let artifact = Artifact { blob: result.delta.clone(), note: result.report.to_owned() };
             change.put_artifact(&record.result_key, "frame", &artifact).await?;
         }
-        let event = FrameEvent {
-            frame,
+        let event = TaskEvent {
             attempt: lease.attempt,
             worker: &lease.worker_id,
             report: result.report,
             seconds: result.seconds,
-            ..FrameEvent::default()
+            ..TaskEvent::of(task)
         };
-        change.append_frame_event(job, FrameState::Done, &event).await?;
+        change.append_task_event(job, TaskState::Done, &event).await?;
         change.commit().await?;
         tracing::info!(
             job_id = %job, frame, attempt = lease.attempt, worker_id = lease.worker_id,
             seconds = result.seconds, "frame done"
         );
         self.tell_stored(job);
-        desk.frame_ended(job);
+        desk.changed(job);
         Ok(())
     }
 
@@ -184,21 +185,22 @@ impl Hub {
                 "every worker lacks the memory for this frame; use fewer Gaussians, smaller images or fewer workers",
             );
             let mut change = self.store.change().await?;
-            change.set_frame_state(&key.job, key.frame, FrameState::Failed).await?;
-            let event = FrameEvent { frame: key.frame, failure: Some(&reason), ..FrameEvent::default() };
-            change.append_frame_event(&key.job, FrameState::Failed, &event).await?;
+            change.set_task_state(&key.job, key.task, TaskState::Failed).await?;
+            let event = TaskEvent { failure: Some(&reason), ..TaskEvent::of(key.task) };
+            change.append_task_event(&key.job, TaskState::Failed, &event).await?;
             change.commit().await?;
             self.tell_stored(&key.job);
-            desk.frame_ended(&key.job);
+            desk.changed(&key.job);
         }
         Ok(())
     }
 }
 
 impl Desk {
-    fn frame_ended(&self, job: &JobId) {
+    /// Wakes the job's driver: something has ended, has come, or has failed.
+    pub(super) fn changed(&self, job: &JobId) {
         if let Some(active) = self.active.get(job) {
-            active.frame_ended.notify_one();
+            active.changed.send_replace(());
         }
     }
 

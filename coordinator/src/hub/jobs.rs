@@ -6,7 +6,7 @@ use std::{
 };
 
 use splat::clip::Clip;
-use tokio::sync::Notify;
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{CancelLease, Dismiss, Failure, coordinator_message::Message};
 
@@ -16,10 +16,10 @@ use crate::{
     failure::StageError,
     queue::{
         JobId,
-        frame::{FrameState, FrameTrigger},
         job::{JobState, JobTrigger},
+        task::TaskState,
     },
-    store::{AttemptOutcome, Change, NewJob, StoreError},
+    store::{AttemptOutcome, Change, NewJob, OrphanedLease, StoreError, TaskEvent},
 };
 
 impl Hub {
@@ -27,10 +27,11 @@ impl Hub {
     pub(crate) async fn recover(self: &Arc<Self>) -> Result<(), StoreError> {
         let mut change = self.store.change().await?;
         change.all_workers_gone().await?;
-        for (job, frame, attempt, lease_id, worker) in change.orphaned_leases().await? {
-            change.end_attempt(&lease_id, AttemptOutcome::Released("the coordinator was restarted")).await?;
-            change.release_frame(&job, frame, attempt, &worker).await?;
-            tracing::info!(job_id = job, frame, attempt, "lease of the former coordinator is void");
+        for OrphanedLease { id, key, attempt, worker } in change.orphaned_leases().await? {
+            change.end_attempt(&id, AttemptOutcome::Released("the coordinator was restarted")).await?;
+            change.release_task(&key, attempt, &worker).await?;
+            let (kind, number) = (key.task.kind(), key.task.number());
+            tracing::info!(job_id = %key.job, kind, number, attempt, "lease of the former coordinator is void");
         }
         change.commit().await?;
         for job in self.store.jobs().await? {
@@ -57,15 +58,13 @@ impl Hub {
         Ok(())
     }
 
-    /// An ended job begins again with what it has; failed and cancelled frames get all their attempts again.
+    /// An ended job begins again with what it has; failed and cancelled tasks get all their attempts again.
     pub(crate) async fn resubmit_job(self: &Arc<Self>, job: &str, clip: Arc<Clip>) -> Result<(), StoreError> {
         let mut change = self.store.change().await?;
         let Ok(next) = change.job_state(job).await?.after(JobTrigger::Resubmit) else { return Ok(()) };
         change.set_job_state(job, next, None).await?;
         change.append_job_event(job, next, None).await?;
-        for frame in change.reopen_frames(job).await? {
-            change.append_ready_event(job, frame).await?;
-        }
+        change.reopen_tasks(job).await?;
         change.commit().await?;
         tracing::info!(job_id = job, "job submitted again");
         self.activate(job, Some(clip)).await;
@@ -76,17 +75,18 @@ impl Hub {
         let id: JobId = id.into();
         let active = ActiveJob {
             stop: self.shutdown.child_token(),
-            frame_ended: Arc::new(Notify::new()),
+            changed: watch::Sender::new(()),
             clip,
             base: None,
+            tracks: None,
             told: None,
         };
-        let (stop, frame_ended) = (active.stop.clone(), active.frame_ended.clone());
+        let (stop, changed) = (active.stop.clone(), active.changed.subscribe());
         let clip = active.clip.clone();
         self.desk.lock().await.active.insert(id.clone(), active);
         self.tell_stored(&id);
         let hub = self.clone();
-        let run = driver::run(hub, id.clone(), stop.clone(), frame_ended, clip);
+        let run = driver::run(hub, id.clone(), stop.clone(), changed, clip);
         self.spawn_driver(id, stop, run);
     }
 
@@ -135,7 +135,7 @@ impl Hub {
         Ok(())
     }
 
-    /// The job's open frames are cancelled, their workers told.
+    /// The job's open tasks are cancelled, their workers told.
     async fn end_job(
         &self,
         desk: &mut Desk,
@@ -150,7 +150,7 @@ impl Hub {
         for lease in &leases {
             change.end_attempt(&lease.id, AttemptOutcome::Cancelled).await?;
         }
-        cancel_open_frames(&mut change, job).await?;
+        cancel_open_tasks(&mut change, job).await?;
         change.set_job_state(job, next, failure.as_ref()).await?;
         change.append_job_event(job, next, failure.as_ref()).await?;
         change.commit().await?;
@@ -239,17 +239,11 @@ impl Hub {
     }
 }
 
-async fn cancel_open_frames(change: &mut Change, job: &JobId) -> Result<(), StoreError> {
-    for frame in change.frames(job).await? {
-        let Ok(next) = frame.state()?.after(FrameTrigger::Cancel) else { continue };
-        debug_assert_eq!(next, FrameState::Cancelled);
-        change.set_frame_state(job, frame.frame, next).await?;
-        let event = crate::store::FrameEvent {
-            frame: frame.frame,
-            attempt: frame.attempts,
-            ..crate::store::FrameEvent::default()
-        };
-        change.append_frame_event(job, next, &event).await?;
+async fn cancel_open_tasks(change: &mut Change, job: &JobId) -> Result<(), StoreError> {
+    for (key, attempt) in change.open_tasks(job).await? {
+        change.set_task_state(job, key.task, TaskState::Cancelled).await?;
+        let event = TaskEvent { attempt, ..TaskEvent::of(key.task) };
+        change.append_task_event(job, TaskState::Cancelled, &event).await?;
     }
     Ok(())
 }

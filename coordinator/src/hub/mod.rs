@@ -8,6 +8,7 @@ mod frames;
 mod jobs;
 mod reports;
 mod sessions;
+mod tracks;
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -17,7 +18,7 @@ use std::{
 
 use splat::{clip::Clip, engine::Engine, gaussians::Gaussians};
 use tokio::{
-    sync::{Notify, Semaphore, broadcast},
+    sync::{Semaphore, broadcast, watch},
     task::JoinSet,
 };
 use tokio_util::sync::CancellationToken;
@@ -29,6 +30,7 @@ use crate::{
     blobs::BlobStore,
     compute::{Compute, panic_message},
     failure::failure,
+    ledger::TrackLedger,
     options::ServeOptions,
     queue::{JobId, Queue, QueuePolicy, SessionId},
     store::{Store, StoreError},
@@ -59,11 +61,12 @@ pub(crate) struct FrameBase {
 pub(crate) struct ActiveJob {
     /// Cancelled when the job is to stop, or the coordinator.
     pub(crate) stop: CancellationToken,
-    /// A frame has ended.
-    pub(crate) frame_ended: Arc<Notify>,
+    /// Marked when something happens that the driver may wait for.
+    pub(crate) changed: watch::Sender<()>,
     /// The clip as the submission opened and digested it.
     pub(crate) clip: Option<Arc<Clip>>,
     base: Option<Arc<FrameBase>>,
+    tracks: Option<TrackLedger>,
     /// Connected workers and waiting frames as clients were last told.
     told: Option<(usize, usize)>,
 }
@@ -253,6 +256,7 @@ impl Hub {
                     tracing::info!(job_id = %id, connected, waiting_frames = now.1, "frames wait for a worker");
                 }
                 self.tell(Notice::Transient(id.clone(), workers_event(now.0, now.1)));
+                job.changed.send_replace(());
             }
         }
     }

@@ -16,7 +16,7 @@ use crate::{
     assembly::{self, AssemblyError},
     blobs::BlobError,
     failure::{StageError, failure},
-    queue::{Lease, SessionId, Stale},
+    queue::{Lease, SessionId, Stale, Task},
     store::{Artifact, CommittedFrame, StoreError},
 };
 
@@ -55,11 +55,16 @@ impl Hub {
                 tracing::info!(lease_id, attempt, "reported again while the result is verified");
                 return Ok(());
             }
-            (Ok(Some((run, lease))), Some(Outcome::Success(success))) => {
-                self.succeeded(&lease, run, success).await?
+            (Ok(Some((run, lease))), outcome) => match (lease.key.task, outcome) {
+                (Task::Frame(_), Some(Outcome::Success(success))) => {
+                    self.succeeded(&lease, run, success).await?
+                }
+                (Task::Tracks(_), Some(Outcome::Tracked(tracked))) => self.tracked(&lease, tracked).await?,
+                (_, outcome) => self.failed(&lease_id, attempt, reason_of(outcome)).await?,
+            },
+            (Err(stale), Some(Outcome::Success(_) | Outcome::Tracked(_))) => {
+                self.stale_success(&lease_id, attempt, &stale).await?
             }
-            (Ok(Some(_)), outcome) => self.failed(&lease_id, attempt, reason_of(outcome)).await?,
-            (Err(stale), Some(Outcome::Success(_))) => self.stale_success(&lease_id, attempt, &stale).await?,
             (Err(stale), _) => {
                 tracing::warn!(lease_id, attempt, %stale, "stale failure refused");
                 Some(stale.to_string())
@@ -83,7 +88,7 @@ impl Hub {
     }
 
     /// A reported attempt has failed. `None`, or why the lease ended meanwhile.
-    async fn failed(
+    pub(super) async fn failed(
         &self,
         lease_id: &str,
         attempt: u32,
@@ -97,7 +102,7 @@ impl Hub {
     }
 
     /// A result does not count: the attempt has failed.
-    async fn refused(
+    pub(super) async fn refused(
         &self,
         lease_id: &str,
         attempt: u32,
@@ -159,7 +164,7 @@ impl Hub {
     }
 
     /// A report that comes again because its receipt was lost is acknowledged; any other stale one is dropped.
-    async fn stale_success(
+    pub(super) async fn stale_success(
         &self,
         lease_id: &str,
         attempt: u32,
@@ -174,7 +179,7 @@ impl Hub {
 
     /// Keeps a verified result that the output folder does not take, so that the resubmitted job need not compute it.
     async fn keep_result(&self, lease: &Lease, success: &Success) -> Result<(), StoreError> {
-        let record = self.store.frame(&lease.key.job, lease.key.frame).await?;
+        let record = self.store.frame(&lease.key.job, lease.key.task.number()).await?;
         let (Some(record), Some(delta)) = (record, &success.delta) else { return Ok(()) };
         let artifact = Artifact { blob: delta.clone(), note: success.report_json.clone() };
         let mut change = self.store.change().await?;
@@ -192,17 +197,22 @@ impl Hub {
         let bug = |message: String| FrameError::Result(failure(FailureKind::Bug, message));
         let delta = success.delta.clone().ok_or_else(|| bug("the worker's result names no delta".into()))?;
         check_report(&success.report_json).map_err(bug)?;
-        let bytes = self.blobs.get(&delta).await.map_err(|error| {
+        let bytes = self.fetched(&delta, "the worker's delta").await.map_err(FrameError::Result)?;
+        self.write_frame(base, lease.key.task.number(), bytes).await?;
+        Ok(delta)
+    }
+
+    /// The verified bytes of a blob that a result names.
+    pub(super) async fn fetched(&self, blob: &Blob, what: &str) -> Result<bytes::Bytes, Failure> {
+        self.blobs.get(blob).await.map_err(|error| {
             let kind = match &error {
                 BlobError::Name(_) | BlobError::TooLarge { .. } => FailureKind::Bug,
                 BlobError::Missing(_) | BlobError::Corrupt { .. } | BlobError::Store(_) => {
                     FailureKind::Transient
                 }
             };
-            FrameError::Result(failure(kind, format!("the worker's delta: {error}")))
-        })?;
-        self.write_frame(base, lease.key.frame, bytes).await?;
-        Ok(delta)
+            failure(kind, format!("{what}: {error}"))
+        })
     }
 
     /// Checks a delta against the static model and writes the frame's file into the output folder.
@@ -241,7 +251,8 @@ impl Hub {
 fn reason_of(outcome: Option<Outcome>) -> Failure {
     match outcome {
         Some(Outcome::Failure(reason)) => reason,
-        _ => failure(FailureKind::Bug, "the worker's report has no outcome"),
+        Some(_) => failure(FailureKind::Bug, "the worker reports the result of another kind of task"),
+        None => failure(FailureKind::Bug, "the worker's report has no outcome"),
     }
 }
 

@@ -7,14 +7,14 @@ use tokio_util::sync::CancellationToken;
 use tonic::Status;
 use trackersplat_proto::v1::{
     CancelLease, CoordinatorMessage, FailureKind, FrameJob, Heartbeat, Lease as LeaseMessage, Progress,
-    Register, coordinator_message::Message, job_event::Event,
+    Register, coordinator_message::Message, job_event::Event, lease,
 };
 
 use super::{Desk, Hub, Notice};
 use crate::{
     failure::failure,
-    queue::{Connected, FailedLease, FrameKey, Lease, SessionId, frame::FrameState},
-    store::{AttemptOutcome, FrameEvent, StoreError},
+    queue::{Connected, FailedLease, JobId, Lease, SessionId, Task, task::TaskState},
+    store::{AttemptOutcome, StoreError, TaskEvent},
 };
 
 /// Messages that may wait for one worker. A worker gets a few per frame; a full queue is a dead connection.
@@ -67,7 +67,7 @@ impl Hub {
             self.forget(&mut desk, older).await?;
         }
         for failed in lost {
-            let message = format!("worker {} came back without this frame", worker.worker_id);
+            let message = format!("worker {} came back without this lease", worker.worker_id);
             self.record_failed(&mut desk, &failed, &failure(FailureKind::LostWorker, message)).await?;
         }
         tracing::info!(worker_id = worker.worker_id, device = worker.device, "worker connected");
@@ -95,12 +95,11 @@ impl Hub {
         let worker_id = self.forget(&mut desk, session).await?;
         tracing::info!(worker_id, reason, "worker drains");
         if let Some(lease) = given_back {
-            let (job, frame) = (&lease.key.job, lease.key.frame);
             let mut change = self.store.change().await?;
             change.end_attempt(&lease.id, AttemptOutcome::Released(reason)).await?;
-            change.release_frame(job, frame, lease.attempt, &worker_id).await?;
+            change.release_task(&lease.key, lease.attempt, &worker_id).await?;
             change.commit().await?;
-            self.tell_stored(job);
+            self.tell_stored(&lease.key.job);
         }
         self.dispatch(&mut desk).await
     }
@@ -117,7 +116,7 @@ impl Hub {
         Ok(entry.worker_id)
     }
 
-    /// A worker asks for a frame.
+    /// A worker asks for a task.
     pub(crate) async fn lease_requested(&self, session: SessionId) -> Result<(), StoreError> {
         let mut desk = self.desk.lock().await;
         desk.queue.park(session);
@@ -134,14 +133,13 @@ impl Hub {
         let mut desk = self.desk.lock().await;
         match desk.queue.heartbeat(session, &lease_id, attempt, Instant::now()) {
             Ok(lease) => {
-                let progress = Progress {
-                    stage,
-                    frame: lease.key.frame,
-                    done,
-                    total,
-                    worker_id: lease.worker_id.clone(),
+                let lease = lease.clone();
+                let (frame, view) = match lease.key.task {
+                    Task::Frame(frame) => (frame, String::new()),
+                    Task::Tracks(position) => (0, desk.view_name(&lease.key.job, position)),
                 };
-                self.tell(Notice::Transient(lease.key.job.clone(), Event::Progress(progress)));
+                let progress = Progress { stage, frame, done, total, worker_id: lease.worker_id, view };
+                self.tell(Notice::Transient(lease.key.job, Event::Progress(progress)));
             }
             Err(stale) => {
                 let reason = stale.to_string();
@@ -175,7 +173,7 @@ impl Hub {
         self.dispatch(&mut desk).await
     }
 
-    /// Gives ready frames to waiting workers: granted on disk before the worker hears of it.
+    /// Gives ready tasks to waiting workers: granted on disk before the worker hears of it.
     pub(super) async fn dispatch(&self, desk: &mut Desk) -> Result<(), StoreError> {
         let new_lease_id = || uuid::Uuid::now_v7().simple().to_string();
         for lease in desk.queue.assign(Instant::now(), new_lease_id) {
@@ -186,34 +184,45 @@ impl Hub {
     }
 
     async fn grant(&self, desk: &mut Desk, lease: Lease) -> Result<(), StoreError> {
-        let Lease { id, attempt, key, worker_id, session, .. } = &lease;
-        let mut change = self.store.change().await?;
-        change.grant(&lease).await?;
-        let event =
-            FrameEvent { frame: key.frame, attempt: *attempt, worker: worker_id, ..FrameEvent::default() };
-        change.append_frame_event(&key.job, FrameState::Leased, &event).await?;
-        change.commit().await?;
-        self.tell_stored(&key.job);
-        let job = Some(self.frame_job(key).await?);
-        let likely_next = match desk.queue.likely_next(&lease) {
-            Some(next) => self
-                .frame_job(next)
-                .await
-                .inspect_err(|error| tracing::warn!(%error, frame = next.frame, "no hint at the next frame"))
-                .ok(),
-            None => None,
+        self.record_grant(&lease).await?;
+        let job = &lease.key.job;
+        let task = match lease.key.task {
+            Task::Frame(frame) => Some(lease::Task::Frame(self.frame_job(job, frame).await?)),
+            // Without tracks to be made there would be no lease of them.
+            Task::Tracks(position) => desk.track_job(job, position).map(lease::Task::Tracks),
         };
-        tracing::info!(job_id = %key.job, frame = key.frame, attempt, worker_id, lease_id = id, "frame leased");
-        let message = LeaseMessage { lease_id: id.clone(), attempt: *attempt, job, likely_next };
-        desk.send(*session, Message::Lease(message));
+        let likely_next = match desk.queue.likely_next(&lease).map(|next| (next.job.clone(), next.task)) {
+            Some((job, Task::Frame(frame))) => self
+                .frame_job(&job, frame)
+                .await
+                .inspect_err(|error| tracing::warn!(%error, frame, "no hint at the next frame"))
+                .ok(),
+            Some((_, Task::Tracks(_))) | None => None,
+        };
+        let message = LeaseMessage { lease_id: lease.id.clone(), attempt: lease.attempt, task, likely_next };
+        desk.send(lease.session, Message::Lease(message));
         Ok(())
     }
 
-    async fn frame_job(&self, key: &FrameKey) -> Result<FrameJob, StoreError> {
-        let record = self.store.frame(&key.job, key.frame).await?;
+    /// A lease is on disk before anybody begins with it.
+    pub(super) async fn record_grant(&self, lease: &Lease) -> Result<(), StoreError> {
+        let Lease { id, attempt, key, worker_id, .. } = lease;
+        let mut change = self.store.change().await?;
+        change.grant(lease).await?;
+        let event = TaskEvent { attempt: *attempt, worker: worker_id, ..TaskEvent::of(key.task) };
+        change.append_task_event(&key.job, TaskState::Leased, &event).await?;
+        change.commit().await?;
+        self.tell_stored(&key.job);
+        let (kind, number) = (key.task.kind(), key.task.number());
+        tracing::info!(job_id = %key.job, kind, number, attempt, worker_id, lease_id = id, "leased");
+        Ok(())
+    }
+
+    async fn frame_job(&self, job: &JobId, frame: u32) -> Result<FrameJob, StoreError> {
+        let record = self.store.frame(job, frame).await?;
         let record = record.ok_or_else(|| StoreError::Value {
-            place: "frames",
-            value: format!("no row for frame {} of job {}", key.frame, key.job),
+            place: "tasks",
+            value: format!("no row for frame {frame} of job {job}"),
         })?;
         record.request()
     }

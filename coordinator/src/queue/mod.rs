@@ -1,11 +1,12 @@
-//! Which frame goes to which worker: pure and synchronous, time is a parameter.
+//! Which task goes to which worker: pure and synchronous, time is a parameter.
 //!
-//! The queue knows the open frames only (ready or leased). Its caller writes every change to the database before any
+//! A task is a frame, or the tracks of one view. The queue knows the open ones only (ready or leased). Its caller writes every change to the database before any
 //! worker or client hears of it, and rebuilds the queue from there after a restart.
 
-pub mod frame;
 pub mod job;
+mod lease;
 pub mod retry;
+pub mod task;
 #[cfg(test)]
 mod tests;
 
@@ -20,7 +21,14 @@ use trackersplat_proto::{
     v1::{FailureKind, Register},
 };
 
-use self::retry::{Decision, decide};
+use self::{
+    lease::Holder,
+    retry::{Decision, decide},
+};
+pub use self::{
+    lease::{Connected, FailedLease, Lease, Stale},
+    task::{Task, TaskKey},
+};
 
 /// A job's name. Names sort in the order of submission.
 pub type JobId = Arc<str>;
@@ -29,81 +37,18 @@ pub type JobId = Arc<str>;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct SessionId(pub u64);
 
-/// One frame of one job; sorts by job, then by frame number.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct FrameKey {
-    /// The job.
-    pub job: JobId,
-    /// Frame number in the clip.
-    pub frame: u32,
+impl SessionId {
+    /// Not a stream: the coordinator itself, whose leases end with it and so need no heartbeat.
+    pub const OWN: Self = Self(0);
 }
 
-/// A worker's right to one frame.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Lease {
-    /// Fencing token, with the attempt.
-    pub id: String,
-    /// Counts the leases of the frame from 1; never used twice.
-    pub attempt: u32,
-    /// What it is for.
-    pub key: FrameKey,
-    /// Who holds it.
-    pub worker_id: String,
-    /// The process that holds it: a worker that was started again does not.
-    incarnation: String,
-    /// The stream over which it is held.
-    pub session: SessionId,
-    /// When it was given.
-    pub since: Instant,
-    /// When it expires without a heartbeat.
-    pub deadline: Instant,
-    /// The stream whose report is being verified; it does not expire meanwhile.
-    reporting: Option<SessionId>,
-}
-
-/// A lease that ended in failure, and what follows.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FailedLease {
-    /// The lease.
-    pub lease: Lease,
-    /// Whether the frame is ready again; else it has failed.
-    pub retried: bool,
-}
-
-/// What a new stream of a worker ends.
-#[derive(Debug, Default, PartialEq)]
-pub struct Connected {
-    /// Older streams of the same worker, which the caller must close.
-    pub replaced: Vec<SessionId>,
-    /// Leases of the worker that it does not hold any more.
-    pub lost: Vec<FailedLease>,
-}
-
-/// Why a heartbeat or report has no effect.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Stale {
-    /// It has expired, was cancelled, or never existed.
-    #[error("lease {0} is not held any more")]
-    NotHeld(String),
-    /// It is held with another attempt.
-    #[error("lease {lease_id} is attempt {held}, the message says {given}")]
-    OtherAttempt {
-        /// The lease.
-        lease_id: String,
-        /// Its attempt.
-        held: u32,
-        /// The message's attempt.
-        given: u32,
-    },
-    /// It was given to another stream.
-    #[error("lease {0} belongs to another worker")]
-    OtherWorker(String),
-}
+/// How the coordinator is called where it does a task itself; no worker can be called that.
+pub const OWN_NAME: &str = "(coordinator)";
 
 /// How many attempts and how much silence the queue admits.
 #[derive(Clone, Copy, Debug)]
 pub struct QueuePolicy {
-    /// Attempts per frame that may fail.
+    /// Attempts per task that may fail.
     pub max_attempts: u32,
     /// A lease without a heartbeat for this long expires.
     pub lease_duration: Duration,
@@ -111,20 +56,20 @@ pub struct QueuePolicy {
     pub reconnect_grace: Duration,
 }
 
-/// What the queue must know of a frame that becomes open.
+/// What the queue must know of a task that becomes open.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct FrameHistory {
+pub struct TaskHistory {
     /// Leases so far.
     pub attempts: u32,
-    /// Failed attempts so far, those through no fault of the frame left out.
+    /// Failed attempts so far, those through no fault of the task left out.
     pub failures: u32,
     /// Workers that lack the resources for it.
     pub excluded: BTreeSet<String>,
 }
 
 #[derive(Debug, Default)]
-struct OpenFrame {
-    history: FrameHistory,
+struct OpenTask {
+    history: TaskHistory,
     /// Workers that were lost with it: others are preferred.
     avoided: BTreeSet<String>,
     lease: Option<String>,
@@ -134,16 +79,16 @@ struct OpenFrame {
 struct Session {
     worker_id: String,
     incarnation: String,
-    /// Place in the line of workers that ask for a frame.
+    /// Place in the line of workers that ask for a task.
     ticket: Option<u64>,
     lease: Option<String>,
 }
 
-/// Open frames, leases, and workers that ask for one.
+/// Open tasks, leases, and workers that ask for one.
 #[derive(Debug)]
 pub struct Queue {
     policy: QueuePolicy,
-    frames: BTreeMap<FrameKey, OpenFrame>,
+    tasks: BTreeMap<TaskKey, OpenTask>,
     leases: BTreeMap<String, Lease>,
     sessions: BTreeMap<SessionId, Session>,
     next_ticket: u64,
@@ -154,16 +99,16 @@ impl Queue {
     pub fn new(policy: QueuePolicy) -> Self {
         Self {
             policy,
-            frames: BTreeMap::new(),
+            tasks: BTreeMap::new(),
             leases: BTreeMap::new(),
             sessions: BTreeMap::new(),
             next_ticket: 0,
         }
     }
 
-    /// Makes a frame ready. A frame that is open already stays as it is.
-    pub fn add(&mut self, key: FrameKey, history: FrameHistory) {
-        self.frames.entry(key).or_insert_with(|| OpenFrame { history, ..OpenFrame::default() });
+    /// Makes a task ready. A task that is open already stays as it is.
+    pub fn add(&mut self, key: TaskKey, history: TaskHistory) {
+        self.tasks.entry(key).or_insert_with(|| OpenTask { history, ..OpenTask::default() });
     }
 
     /// A worker's stream opens, in place of older ones of the same worker. A lease that this very process still holds
@@ -214,7 +159,7 @@ impl Queue {
         Some(lease)
     }
 
-    /// A worker asks for one frame. It waits until one is there and it holds no lease.
+    /// A worker asks for one task. It waits until one is there and it holds no lease.
     pub fn park(&mut self, session: SessionId) {
         let ticket = self.next_ticket;
         if let Some(session) = self.sessions.get_mut(&session)
@@ -225,7 +170,7 @@ impl Queue {
         }
     }
 
-    /// Gives ready frames to waiting workers, first come first served; frames in order of job and number.
+    /// Gives ready tasks to waiting workers, first come first served; tasks in the order of their keys.
     pub fn assign(&mut self, now: Instant, mut new_lease_id: impl FnMut() -> String) -> Vec<Lease> {
         let mut waiting: Vec<(u64, SessionId)> = self
             .sessions
@@ -247,47 +192,78 @@ impl Queue {
         new_lease_id: &mut impl FnMut() -> String,
     ) -> Option<Lease> {
         let Session { worker_id, incarnation, .. } = self.sessions.get(&session_id)?;
-        let (worker_id, incarnation) = (worker_id.clone(), incarnation.clone());
-        let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());
-        let key = ready.into_iter().find(|(_, frame)| self.may_take(frame, &worker_id))?.0.clone();
-        let frame = self.frames.get_mut(&key)?;
-        frame.history.attempts += 1;
-        let id = new_lease_id();
-        frame.lease = Some(id.clone());
+        let holder =
+            Holder { worker_id: worker_id.clone(), incarnation: incarnation.clone(), session: session_id };
+        let key = self.ready().find(|(_, task)| self.may_take(task, &holder.worker_id))?.0.clone();
+        let lease = self.give(key, holder, now, new_lease_id())?;
+        let session = self.sessions.get_mut(&session_id)?;
+        session.ticket = None;
+        session.lease = Some(lease.id.clone());
+        Some(lease)
+    }
+
+    /// Whether the coordinator is to track a view of a job itself: no connected worker may.
+    pub fn has_own_work(&self, job: &str) -> bool {
+        self.own_work(job).is_some()
+    }
+
+    /// The coordinator's own lease of such a view.
+    pub fn lease_own(&mut self, job: &str, now: Instant, lease_id: String) -> Option<Lease> {
+        let key = self.own_work(job)?.clone();
+        let holder =
+            Holder { worker_id: OWN_NAME.to_owned(), incarnation: String::new(), session: SessionId::OWN };
+        self.give(key, holder, now, lease_id)
+    }
+
+    fn own_work(&self, job: &str) -> Option<&TaskKey> {
+        let is_left = |(key, task): &(&TaskKey, &OpenTask)| {
+            let of_job = &*key.job == job && matches!(key.task, Task::Tracks(_));
+            of_job && !self.is_servable(task) && !task.history.excluded.contains(OWN_NAME)
+        };
+        self.ready().find(is_left).map(|(key, _)| key)
+    }
+
+    fn give(&mut self, key: TaskKey, holder: Holder, now: Instant, id: String) -> Option<Lease> {
+        let task = self.tasks.get_mut(&key)?;
+        task.history.attempts += 1;
+        task.lease = Some(id.clone());
+        let Holder { worker_id, incarnation, session } = holder;
         let lease = Lease {
             id: id.clone(),
-            attempt: frame.history.attempts,
+            attempt: task.history.attempts,
             key,
             worker_id,
             incarnation,
-            session: session_id,
+            session,
             since: now,
             deadline: now + self.policy.lease_duration,
             reporting: None,
         };
-        let session = self.sessions.get_mut(&session_id)?;
-        session.ticket = None;
-        session.lease = Some(id.clone());
         self.leases.insert(id, lease.clone());
         Some(lease)
     }
 
     /// What the holder of a lease that was just given will likely be given next: those with older leases ask before it
-    /// does. Of leases given at the same time those of earlier frames count as older.
-    pub fn likely_next(&self, lease: &Lease) -> Option<&FrameKey> {
+    /// does. Of leases given at the same time those of earlier tasks count as older.
+    pub fn likely_next(&self, lease: &Lease) -> Option<&TaskKey> {
         let age = |lease: &Lease| (lease.since, lease.key.clone());
-        let older = self.leases.values().filter(|other| age(other) < age(lease)).count();
-        let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());
-        ready.filter(|(_, frame)| self.may_take(frame, &lease.worker_id)).nth(older).map(|(key, _)| key)
+        let of_workers = self.leases.values().filter(|other| other.session != SessionId::OWN);
+        let older = of_workers.filter(|other| age(other) < age(lease)).count();
+        let may_take = |task: &OpenTask| self.may_take(task, &lease.worker_id);
+        self.ready().filter(|(_, task)| may_take(task)).nth(older).map(|(key, _)| key)
     }
 
-    /// Whether a worker may take a frame: never if it lacks the resources; if it was lost with the frame before, only
+    fn ready(&self) -> impl Iterator<Item = (&TaskKey, &OpenTask)> {
+        self.tasks.iter().filter(|(_, task)| task.lease.is_none())
+    }
+
+    /// Whether a worker may take a task: never if it lacks the resources; if it was lost with the task before, only
     /// while no other worker could take it.
-    fn may_take(&self, frame: &OpenFrame, worker_id: &str) -> bool {
-        if frame.history.excluded.contains(worker_id) {
+    fn may_take(&self, task: &OpenTask, worker_id: &str) -> bool {
+        if task.history.excluded.contains(worker_id) {
             return false;
         }
-        let is_unburdened = |id: &str| !frame.history.excluded.contains(id) && !frame.avoided.contains(id);
+        let is_unburdened = |id: &str| !task.history.excluded.contains(id) && !task.avoided.contains(id);
         is_unburdened(worker_id) || !self.sessions.values().any(|session| is_unburdened(&session.worker_id))
     }
 
@@ -327,11 +303,11 @@ impl Queue {
         self.end_failed(&abandoned, FailureKind::Bug)
     }
 
-    /// The verified result counts: the frame is closed.
+    /// The verified result counts: the task is closed.
     pub fn commit(&mut self, lease_id: &str, attempt: u32) -> Result<Lease, Stale> {
         self.in_force(lease_id, attempt)?;
         let lease = self.end(lease_id).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))?;
-        self.frames.remove(&lease.key);
+        self.tasks.remove(&lease.key);
         Ok(lease)
     }
 
@@ -343,55 +319,65 @@ impl Queue {
 
     /// Leases without a sign of life have failed as lost.
     pub fn expire(&mut self, now: Instant) -> Vec<FailedLease> {
-        let silent = self.leases.values().filter(|lease| lease.reporting.is_none() && lease.deadline <= now);
+        let silent = self.leases.values().filter(|lease| lease.may_expire() && lease.deadline <= now);
         let silent: Vec<String> = silent.map(|lease| lease.id.clone()).collect();
         silent.iter().filter_map(|id| self.end_failed(id, FailureKind::LostWorker)).collect()
     }
 
-    /// Closes every open frame of a job. Returns its leases, whose holders must be told.
+    /// Closes every open task of a job. Returns its leases, whose holders must be told.
     pub fn cancel_job(&mut self, job: &str) -> Vec<Lease> {
         let held = self.leases.values().filter(|lease| &*lease.key.job == job);
         let held: Vec<String> = held.map(|lease| lease.id.clone()).collect();
         let ended = held.iter().filter_map(|id| self.end(id)).collect();
-        self.frames.retain(|key, _| &*key.job != job);
+        self.tasks.retain(|key, _| &*key.job != job);
         ended
     }
 
-    /// Closes a ready frame that no worker is to compute. Whether it was there and not leased.
-    pub fn close_ready(&mut self, key: &FrameKey) -> bool {
-        let is_ready = self.frames.get(key).is_some_and(|frame| frame.lease.is_none());
-        is_ready && self.frames.remove(key).is_some()
+    /// Closes a ready task that no worker is to do. Whether it was there and not leased.
+    pub fn close_ready(&mut self, key: &TaskKey) -> bool {
+        let is_ready = self.tasks.get(key).is_some_and(|task| task.lease.is_none());
+        is_ready && self.tasks.remove(key).is_some()
     }
 
-    /// Ready frames of a job that no connected worker may take.
+    /// Ready frames of a job that no connected worker may take. Tracks never wait: the coordinator does them itself.
     pub fn waiting_frames(&self, job: &str) -> usize {
-        let ready = self.frames.iter().filter(|(key, frame)| &*key.job == job && frame.lease.is_none());
-        ready.filter(|(_, frame)| !self.is_servable(frame)).count()
+        self.unservable_frames().filter(|key| &*key.job == job).count()
     }
 
     /// Ready frames for which every connected worker, and there is at least one, lacks the resources. None while a
     /// worker may come back to its lease: it may be the one that has them.
-    pub fn frames_beyond_all_workers(&self) -> Vec<FrameKey> {
-        let is_held = |lease: &Lease| self.sessions.contains_key(&lease.session);
+    pub fn frames_beyond_all_workers(&self) -> Vec<TaskKey> {
+        let is_held =
+            |lease: &Lease| lease.session == SessionId::OWN || self.sessions.contains_key(&lease.session);
         if self.sessions.is_empty() || !self.leases.values().all(is_held) {
             return Vec::new();
         }
-        let ready = self.frames.iter().filter(|(_, frame)| frame.lease.is_none());
-        ready.filter(|(_, frame)| !self.is_servable(frame)).map(|(key, _)| key.clone()).collect()
+        self.unservable_frames().cloned().collect()
     }
 
-    fn is_servable(&self, frame: &OpenFrame) -> bool {
-        self.sessions.values().any(|session| !frame.history.excluded.contains(&session.worker_id))
+    fn unservable_frames(&self) -> impl Iterator<Item = &TaskKey> {
+        let is_frame = |key: &TaskKey| matches!(key.task, Task::Frame(_));
+        let beyond = self.ready().filter(move |(key, task)| is_frame(key) && !self.is_servable(task));
+        beyond.map(|(key, _)| key)
     }
 
-    /// Open frames of a job.
-    pub fn open_frames(&self, job: &str) -> usize {
-        self.frames.keys().filter(|key| &*key.job == job).count()
+    fn is_servable(&self, task: &OpenTask) -> bool {
+        self.sessions.values().any(|session| !task.history.excluded.contains(&session.worker_id))
+    }
+
+    /// Open tasks of a job.
+    pub fn open_tasks(&self, job: &str) -> usize {
+        self.tasks.keys().filter(|key| &*key.job == job).count()
     }
 
     /// Connected workers.
     pub fn connected(&self) -> usize {
         self.sessions.len()
+    }
+
+    /// Whether a lease is still held with this attempt, over whatever stream.
+    pub fn check(&mut self, lease_id: &str, attempt: u32) -> Result<(), Stale> {
+        self.in_force(lease_id, attempt).map(|_| ())
     }
 
     fn held(&mut self, session: SessionId, lease_id: &str, attempt: u32) -> Result<&mut Lease, Stale> {
@@ -420,28 +406,28 @@ impl Queue {
         Some(lease)
     }
 
-    fn reopen(&mut self, key: &FrameKey) {
-        if let Some(frame) = self.frames.get_mut(key) {
-            frame.lease = None;
+    fn reopen(&mut self, key: &TaskKey) {
+        if let Some(task) = self.tasks.get_mut(key) {
+            task.lease = None;
         }
     }
 
     fn end_failed(&mut self, lease_id: &str, kind: FailureKind) -> Option<FailedLease> {
         let lease = self.end(lease_id)?;
-        let frame = self.frames.get_mut(&lease.key)?;
-        frame.lease = None;
-        frame.history.failures += 1;
-        let decision = decide(kind, frame.history.failures, self.policy.max_attempts);
+        let task = self.tasks.get_mut(&lease.key)?;
+        task.lease = None;
+        task.history.failures += 1;
+        let decision = decide(kind, task.history.failures, self.policy.max_attempts);
         match decision {
             Decision::Retry(RetryPolicy::OnlyAnotherWorker) => {
-                frame.history.excluded.insert(lease.worker_id.clone());
+                task.history.excluded.insert(lease.worker_id.clone());
             }
             Decision::Retry(RetryPolicy::PreferAnotherWorker) => {
-                frame.avoided.insert(lease.worker_id.clone());
+                task.avoided.insert(lease.worker_id.clone());
             }
             Decision::Retry(_) => {}
             Decision::GiveUp => {
-                self.frames.remove(&lease.key);
+                self.tasks.remove(&lease.key);
             }
         }
         Some(FailedLease { lease, retried: decision != Decision::GiveUp })

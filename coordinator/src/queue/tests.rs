@@ -15,7 +15,7 @@ impl Bench {
         let policy = QueuePolicy { max_attempts: 3, lease_duration: LEASE, reconnect_grace: GRACE };
         let mut queue = Queue::new(policy);
         for frame in frames {
-            queue.add(key(frame), FrameHistory::default());
+            queue.add(key(frame), TaskHistory::default());
         }
         Self { queue, now: Instant::now(), leases: 0 }
     }
@@ -63,14 +63,14 @@ fn register(worker: &str, incarnation: &str, held_lease_id: &str) -> Register {
     }
 }
 
-fn key(frame: u32) -> FrameKey {
-    FrameKey { job: "job".into(), frame }
+fn key(frame: u32) -> TaskKey {
+    TaskKey { job: "job".into(), task: Task::Frame(frame) }
 }
 
 #[test]
 fn those_who_began_earlier_will_ask_earlier() {
     let mut bench = Bench::new(1..=5);
-    let next = |bench: &Bench, lease: &Lease| bench.queue.likely_next(lease).map(|key| key.frame);
+    let next = |bench: &Bench, lease: &Lease| bench.queue.likely_next(lease).map(|key| key.task.number());
     bench.connect(1, "one");
     let lease = bench.assign_one();
     assert_eq!(next(&bench, &lease), Some(2), "nobody else works");
@@ -91,7 +91,7 @@ fn workers_that_begin_together_expect_different_frames() {
         bench.connect(session, worker);
     }
     let leases = bench.assign();
-    let next = leases.iter().map(|lease| bench.queue.likely_next(lease).map(|key| key.frame));
+    let next = leases.iter().map(|lease| bench.queue.likely_next(lease).map(|key| key.task.number()));
     assert_eq!(next.collect::<Vec<_>>(), [Some(4), Some(5), None]);
 }
 
@@ -103,7 +103,8 @@ fn frames_go_out_in_order_to_the_worker_that_asked_first() {
     bench.connect(2, "early");
     bench.queue.park(late);
     let leases = bench.assign();
-    let given: Vec<_> = leases.iter().map(|lease| (lease.worker_id.as_str(), lease.key.frame)).collect();
+    let given: Vec<_> =
+        leases.iter().map(|lease| (lease.worker_id.as_str(), lease.key.task.number())).collect();
     assert_eq!(given, [("early", 1), ("late", 2)]);
     assert_eq!(bench.assign(), [], "both are busy");
 }
@@ -111,8 +112,8 @@ fn frames_go_out_in_order_to_the_worker_that_asked_first() {
 #[test]
 fn an_earlier_job_goes_first() {
     let mut bench = Bench::new([]);
-    bench.queue.add(FrameKey { job: "b".into(), frame: 1 }, FrameHistory::default());
-    bench.queue.add(FrameKey { job: "a".into(), frame: 9 }, FrameHistory::default());
+    bench.queue.add(TaskKey { job: "b".into(), task: Task::Frame(1) }, TaskHistory::default());
+    bench.queue.add(TaskKey { job: "a".into(), task: Task::Frame(9) }, TaskHistory::default());
     bench.connect(1, "w");
     assert_eq!(&*bench.assign_one().key.job, "a");
 }
@@ -132,7 +133,7 @@ fn a_committed_frame_is_closed_and_its_lease_dead() {
     bench.connect(1, "w");
     let lease = bench.assign_one();
     assert_eq!(bench.queue.commit(&lease.id, 1).expect("held").key, key(1));
-    assert_eq!(bench.queue.open_frames("job"), 0);
+    assert_eq!(bench.queue.open_tasks("job"), 0);
     assert_eq!(bench.queue.commit(&lease.id, 1), Err(Stale::NotHeld(lease.id)));
 }
 
@@ -189,7 +190,7 @@ fn a_frame_fails_for_good_after_three_failed_attempts() {
         assert_eq!(lease.attempt, attempt);
         assert_eq!(bench.fail(&lease, FailureKind::Transient).retried, retried);
     }
-    assert_eq!(bench.queue.open_frames("job"), 0);
+    assert_eq!(bench.queue.open_tasks("job"), 0);
     assert_eq!(bench.assign(), []);
 }
 
@@ -199,7 +200,7 @@ fn bad_input_is_not_tried_again() {
     bench.connect(1, "w");
     let lease = bench.assign_one();
     assert!(!bench.fail(&lease, FailureKind::BadInput).retried);
-    assert_eq!(bench.queue.open_frames("job"), 0);
+    assert_eq!(bench.queue.open_tasks("job"), 0);
 }
 
 #[test]
@@ -239,19 +240,19 @@ fn a_draining_worker_gives_its_frame_back_without_a_failure() {
         let given_back = bench.queue.drain(session).expect("a lease");
         assert_eq!(given_back.attempt, attempt, "attempts count up, so that stale reports are told apart");
     }
-    assert_eq!((bench.queue.open_frames("job"), bench.queue.connected()), (1, 0));
+    assert_eq!((bench.queue.open_tasks("job"), bench.queue.connected()), (1, 0));
 }
 
 #[test]
 fn a_cancelled_job_loses_its_leases_and_frames_and_no_other() {
     let mut bench = Bench::new([1, 2]);
-    bench.queue.add(FrameKey { job: "other".into(), frame: 1 }, FrameHistory::default());
+    bench.queue.add(TaskKey { job: "other".into(), task: Task::Frame(1) }, TaskHistory::default());
     let session = bench.connect(1, "w");
     let lease = bench.assign_one();
     let cancelled = bench.queue.cancel_job("job");
     assert_eq!(cancelled.as_slice(), std::slice::from_ref(&lease));
     assert_eq!(bench.queue.cancel_job("job"), []);
-    assert_eq!((bench.queue.open_frames("job"), bench.queue.open_frames("other")), (0, 1));
+    assert_eq!((bench.queue.open_tasks("job"), bench.queue.open_tasks("other")), (0, 1));
     assert!(bench.queue.commit(&lease.id, 1).is_err());
     bench.queue.park(session);
     assert_eq!(&*bench.assign_one().key.job, "other");
@@ -374,7 +375,7 @@ fn no_frame_is_beyond_all_workers_while_one_may_come_back() {
 fn attempts_go_on_from_the_history() {
     let mut bench = Bench::new([]);
     let excluded = BTreeSet::from(["small".to_owned()]);
-    bench.queue.add(key(1), FrameHistory { attempts: 4, failures: 2, excluded });
+    bench.queue.add(key(1), TaskHistory { attempts: 4, failures: 2, excluded });
     bench.connect(1, "small");
     assert_eq!(bench.assign(), []);
     bench.connect(2, "w");
@@ -391,4 +392,78 @@ fn with_no_worker_every_ready_frame_waits() {
     bench.connect(1, "w");
     assert_eq!(bench.queue.waiting_frames("job"), 0);
     assert!(bench.queue.close_ready(&key(3)) && !bench.queue.close_ready(&key(3)));
+}
+
+fn tracks(position: u32) -> TaskKey {
+    TaskKey { job: "job".into(), task: Task::Tracks(position) }
+}
+
+fn lease_own(bench: &mut Bench) -> Option<Lease> {
+    bench.leases += 1;
+    bench.queue.lease_own("job", bench.now, format!("lease-{}", bench.leases))
+}
+
+#[test]
+fn tracks_go_before_the_frames_of_their_job_and_after_those_of_earlier_jobs() {
+    let mut bench = Bench::new([1, 2]);
+    bench.queue.add(tracks(5), TaskHistory::default());
+    bench.queue.add(tracks(3), TaskHistory::default());
+    bench.queue.add(TaskKey { job: "earlier".into(), task: Task::Frame(9) }, TaskHistory::default());
+    for session in 1..=6 {
+        bench.connect(session, &format!("w{session}"));
+    }
+    let order: Vec<Task> = bench.assign().into_iter().map(|lease| lease.key.task).collect();
+    let expected = [Task::Frame(9), Task::Tracks(3), Task::Tracks(5), Task::Frame(1), Task::Frame(2)];
+    assert_eq!(order, expected, "the sixth worker waits");
+}
+
+#[test]
+fn the_coordinator_tracks_itself_only_what_no_connected_worker_may() {
+    let mut bench = Bench::new([1]);
+    bench.queue.add(tracks(0), TaskHistory::default());
+    bench.queue.add(tracks(1), TaskHistory::default());
+    bench.queue.add(tracks(2), TaskHistory::default());
+    let own = lease_own(&mut bench).expect("nobody is connected");
+    assert_eq!((own.key.clone(), own.worker_id.as_str(), own.session), (tracks(0), OWN_NAME, SessionId::OWN));
+    assert!(!bench.queue.has_own_work("another job"));
+
+    let small = bench.connect(1, "small");
+    assert_eq!(lease_own(&mut bench), None, "a worker is there");
+    let lease = bench.assign_one();
+    assert_eq!(lease.key, tracks(1), "what the coordinator has begun is not done twice");
+    bench.fail(&lease, FailureKind::OutOfResources);
+    assert_eq!(bench.assign_one().key, tracks(2));
+    assert_eq!(lease_own(&mut bench).expect("no worker has the memory").key, tracks(1));
+    assert_eq!(bench.queue.waiting_frames("job"), 0);
+    bench.lose(small);
+    assert_eq!(lease_own(&mut bench).expect("the worker is gone").key, tracks(2));
+    assert_eq!(lease_own(&mut bench), None, "frames are for workers");
+    assert_eq!(bench.queue.waiting_frames("job"), 1);
+}
+
+#[test]
+fn own_leases_need_no_heartbeat_and_count_as_no_worker() {
+    let mut bench = Bench::new([]);
+    bench.queue.add(tracks(0), TaskHistory::default());
+    let own = lease_own(&mut bench).expect("nobody is connected");
+    assert_eq!(bench.queue.expire(bench.now + 100 * LEASE), []);
+    assert_eq!((bench.queue.connected(), bench.queue.open_tasks("job")), (0, 1));
+    let failed = bench.queue.fail(&own.id, own.attempt, FailureKind::OutOfResources).expect("held");
+    assert!(failed.retried);
+    assert_eq!(lease_own(&mut bench), None, "it lacks the memory and waits for a worker");
+    bench.connect(1, "large");
+    let lease = bench.assign_one();
+    assert_eq!((lease.worker_id.as_str(), lease.attempt), ("large", 2));
+    assert!(bench.queue.commit(&lease.id, 2).is_ok());
+    assert_eq!(bench.queue.open_tasks("job"), 0);
+}
+
+#[test]
+fn a_hint_is_given_past_tracks_that_are_given_out_before() {
+    let mut bench = Bench::new([1, 2]);
+    bench.queue.add(tracks(0), TaskHistory::default());
+    bench.queue.add(tracks(1), TaskHistory::default());
+    bench.connect(1, "one");
+    let lease = bench.assign_one();
+    assert_eq!(bench.queue.likely_next(&lease), Some(&tracks(1)));
 }

@@ -8,6 +8,7 @@ use std::{
 use splat::{
     clip::{Clip, Split},
     settings::{MotionSource, Settings},
+    tracking::learned::LearnedTracker,
 };
 use tonic::Status;
 use trackersplat_proto::v1::{SubmitRequest, SubmitResponse, submit_request::Tracks};
@@ -20,6 +21,7 @@ use crate::{
     assembly::{SEQUENCE, holds_results},
     hub::{Hub, SharedHub},
     keys::VERSION,
+    model,
     output::{self, Marker, OutputError},
     queue::job::JobState,
     request::{InputFile, JobRequest, TrackSource, by_url},
@@ -42,11 +44,12 @@ struct Submission {
 pub(super) fn check(request: &SubmitRequest) -> Result<(), Status> {
     read_settings(&request.settings_json)?;
     read_frames(request.first_frame, request.last_frame)?;
-    let files: &[String] = match &request.tracks {
-        Some(Tracks::TrackFiles(files)) => &files.paths,
+    let files = match &request.tracks {
+        Some(Tracks::TrackFiles(files)) => files.paths.as_slice(),
+        Some(Tracks::TrackerModel(file)) => std::slice::from_ref(file),
         Some(Tracks::ExactTracks(_)) | None => &[],
     };
-    let files = files.iter().map(|file| ("tracks", file));
+    let files = files.iter().map(|file| ("tracks or tracker", file));
     let given = [("static model", &request.static_model), ("output", &request.output)].into_iter();
     for (what, path) in given.filter(|(_, path)| !path.is_empty()).chain(files) {
         local_path(what, path)?;
@@ -188,7 +191,7 @@ fn read(
             "" => None,
             path => Some(input_file("static model", path)?),
         },
-        tracks: read_tracks(request.tracks)?,
+        tracks: read_tracks(request.tracks, &settings)?,
         clip_url,
         ..JobRequest::default()
     };
@@ -248,7 +251,7 @@ fn read_frames(first: u32, last: u32) -> Result<Option<(u32, u32)>, Status> {
     }
 }
 
-fn read_tracks(tracks: Option<Tracks>) -> Result<TrackSource, Status> {
+fn read_tracks(tracks: Option<Tracks>, settings: &Settings) -> Result<TrackSource, Status> {
     match tracks {
         None => Ok(TrackSource::Own),
         Some(Tracks::ExactTracks(_)) => Ok(TrackSource::Exact(Vec::new())),
@@ -258,6 +261,14 @@ fn read_tracks(tracks: Option<Tracks>) -> Result<TrackSource, Status> {
         Some(Tracks::TrackFiles(files)) => {
             let files: Result<_, _> = files.paths.iter().map(|path| input_file("tracks", path)).collect();
             files.map(TrackSource::Files)
+        }
+        Some(Tracks::TrackerModel(path)) => {
+            let (file, bytes) =
+                model::read(&local_path("tracker", &path)?).map_err(Status::invalid_argument)?;
+            // What no worker could use is refused before anything is computed for it.
+            LearnedTracker::from_onnx(bytes, &file.path, &settings.tracking.onnx)
+                .map_err(|error| Status::invalid_argument(error.to_string()))?;
+            Ok(TrackSource::Learned(file))
         }
     }
 }

@@ -119,6 +119,7 @@ impl WorkerStream {
             match message.message {
                 Some(Message::LeaseRequest(_)) => self.hub.lease_requested(session).await?,
                 Some(Message::Heartbeat(heartbeat)) => self.hub.heartbeat(session, heartbeat).await,
+                Some(Message::Field(report)) => self.hub.field_reported(session, report).await?,
                 Some(Message::Report(report)) => self.hub.report(session, report).await?,
                 Some(Message::GoingAway(going)) => {
                     self.hub.going_away(session, &going.reason).await?;

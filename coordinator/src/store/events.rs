@@ -2,11 +2,11 @@
 
 use sqlx::FromRow;
 use trackersplat_proto::v1::{
-    Failure, FailureKind, FrameStateChanged, JobEvent, JobStateChanged, job_event::Event,
+    Failure, FailureKind, FrameStateChanged, JobEvent, JobStateChanged, TracksStateChanged, job_event::Event,
 };
 
 use super::{Change, Store, StoreError, signed, unsigned};
-use crate::queue::{frame::FrameState, job::JobState};
+use crate::queue::{Task, job::JobState, task::TaskState};
 
 #[derive(FromRow)]
 struct EventRow {
@@ -14,7 +14,8 @@ struct EventRow {
     sequence: i64,
     kind: String,
     state: String,
-    frame: u32,
+    number: u32,
+    view: String,
     attempt: u32,
     worker: String,
     failure_kind: String,
@@ -27,18 +28,27 @@ impl EventRow {
     fn into_wire(self) -> Result<JobEvent, StoreError> {
         let failure = failure(&self.failure_kind, &self.message);
         let wrong_state = || StoreError::Value { place: "events.state", value: self.state.clone() };
+        let task_state = || TaskState::from_label(&self.state).ok_or_else(wrong_state);
         let event = match self.kind.as_str() {
             "job" => {
                 let state = JobState::from_label(&self.state).ok_or_else(wrong_state)?;
                 Event::JobState(JobStateChanged { state: state.to_wire().into(), failure })
             }
             "frame" => Event::FrameState(FrameStateChanged {
-                frame: self.frame,
-                state: FrameState::from_label(&self.state).ok_or_else(wrong_state)?.to_wire().into(),
+                frame: self.number,
+                state: task_state()?.to_wire().into(),
                 attempt: self.attempt,
                 worker_id: self.worker,
                 failure,
                 report_json: self.report,
+                seconds: self.seconds,
+            }),
+            "tracks" => Event::TracksState(TracksStateChanged {
+                state: task_state()?.to_wire().into(),
+                view: self.view,
+                attempt: self.attempt,
+                worker_id: self.worker,
+                failure,
                 seconds: self.seconds,
             }),
             _ => return Err(StoreError::Value { place: "events.kind", value: self.kind }),
@@ -47,15 +57,22 @@ impl EventRow {
     }
 }
 
-/// What is stored of a frame's change.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct FrameEvent<'a> {
-    pub(crate) frame: u32,
+/// What is stored of a task's change.
+#[derive(Clone, Debug)]
+pub(crate) struct TaskEvent<'a> {
+    pub(crate) task: Task,
     pub(crate) attempt: u32,
     pub(crate) worker: &'a str,
     pub(crate) failure: Option<&'a Failure>,
     pub(crate) report: &'a str,
     pub(crate) seconds: f64,
+}
+
+impl TaskEvent<'_> {
+    /// A change of which only the new state is to be said.
+    pub(crate) fn of(task: Task) -> Self {
+        Self { task, attempt: 0, worker: "", failure: None, report: "", seconds: 0.0 }
+    }
 }
 
 impl Store {
@@ -80,36 +97,39 @@ impl Change {
         state: JobState,
         failure: Option<&Failure>,
     ) -> Result<u64, StoreError> {
-        self.append(job, "job", state.label(), &FrameEvent { failure, ..FrameEvent::default() }).await
+        let sequence = self.next_sequence(job).await?;
+        let (failure_kind, message) = failure_columns(failure);
+        let sql = "INSERT INTO events (job_id, sequence, at, kind, state, failure_kind, message) \
+                   VALUES (?, ?, strftime('%Y-%m-%dT%H:%M:%fZ', 'now'), 'job', ?, ?, ?)";
+        let query = sqlx::query(sql).bind(job).bind(sequence).bind(state.label()).bind(failure_kind);
+        query.bind(message).execute(&mut *self.transaction).await?;
+        Ok(unsigned(sequence))
     }
 
-    /// Appends a frame's new state to the job's events.
-    pub(crate) async fn append_frame_event(
+    /// Appends a task's new state to the job's events.
+    pub(crate) async fn append_task_event(
         &mut self,
         job: &str,
-        state: FrameState,
-        event: &FrameEvent<'_>,
+        state: TaskState,
+        event: &TaskEvent<'_>,
     ) -> Result<u64, StoreError> {
-        self.append(job, "frame", state.label(), event).await
-    }
-
-    async fn append(
-        &mut self,
-        job: &str,
-        kind: &str,
-        state: &str,
-        event: &FrameEvent<'_>,
-    ) -> Result<u64, StoreError> {
-        let sql = "UPDATE jobs SET last_sequence = last_sequence + 1 WHERE id = ? RETURNING last_sequence";
-        let sequence: i64 = sqlx::query_scalar(sql).bind(job).fetch_one(&mut *self.transaction).await?;
+        let sequence = self.next_sequence(job).await?;
+        let (kind, number) = (event.task.kind(), event.task.number());
         let (failure_kind, message) = failure_columns(event.failure);
-        let sql = "INSERT INTO events (job_id, sequence, at, kind, state, frame, attempt, worker, failure_kind, \
-                   message, report, seconds) \
-                   VALUES (?, ?, strftime('%Y-%m-%dT%H:%M:%fZ', 'now'), ?, ?, ?, ?, ?, ?, ?, ?, ?)";
-        let query = sqlx::query(sql).bind(job).bind(sequence).bind(kind).bind(state).bind(event.frame);
+        let sql = "INSERT INTO events (job_id, sequence, at, kind, state, number, view, attempt, worker, \
+                   failure_kind, message, report, seconds) \
+                   VALUES (?1, ?2, strftime('%Y-%m-%dT%H:%M:%fZ', 'now'), ?3, ?4, ?5, \
+                   CASE WHEN ?3 = 'tracks' THEN (SELECT name FROM views WHERE job_id = ?1 AND position = ?5) \
+                   ELSE '' END, ?6, ?7, ?8, ?9, ?10, ?11)";
+        let query = sqlx::query(sql).bind(job).bind(sequence).bind(kind).bind(state.label()).bind(number);
         let query = query.bind(event.attempt).bind(event.worker).bind(failure_kind).bind(message);
         query.bind(event.report).bind(event.seconds).execute(&mut *self.transaction).await?;
         Ok(unsigned(sequence))
+    }
+
+    async fn next_sequence(&mut self, job: &str) -> Result<i64, StoreError> {
+        let sql = "UPDATE jobs SET last_sequence = last_sequence + 1 WHERE id = ? RETURNING last_sequence";
+        Ok(sqlx::query_scalar(sql).bind(job).fetch_one(&mut *self.transaction).await?)
     }
 }
 

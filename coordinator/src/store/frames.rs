@@ -1,14 +1,14 @@
-//! Views, images, frames and their attempts.
+//! Views, images and frames.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use prost::Message;
 use splat::cameras::Camera;
 use sqlx::FromRow;
-use trackersplat_proto::v1::{Blob, FailureKind, FrameJob};
+use trackersplat_proto::v1::{Blob, FrameJob};
 
-use super::{Change, Store, StoreError, signed, unsigned};
-use crate::queue::{FrameHistory, Lease, frame::FrameState};
+use super::{Change, Store, StoreError, signed, tasks::TaskRecord, unsigned};
+use crate::queue::{Task, TaskHistory, task::TaskState};
 
 /// A view of a job's clip.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,15 +36,11 @@ pub struct ImageRecord {
 #[derive(Clone, Debug, FromRow)]
 pub struct FrameRecord {
     /// Frame number.
+    #[sqlx(rename = "number")]
     pub frame: u32,
-    state: String,
-    /// Leases given.
-    pub attempts: u32,
-    /// Attempts that failed.
-    pub failures: u32,
-    excluded: String,
-    /// Worker of the last attempt.
-    pub worker: String,
+    /// What it shares with every task.
+    #[sqlx(flatten)]
+    pub task: TaskRecord,
     request: Vec<u8>,
     /// Names the result among the artifacts.
     pub result_key: String,
@@ -52,8 +48,6 @@ pub struct FrameRecord {
     delta_size: i64,
     /// JSON; empty unless done.
     pub report: String,
-    /// From lease to result.
-    pub seconds: f64,
     stage_seconds: String,
 }
 
@@ -72,37 +66,21 @@ pub struct CommittedFrame<'a> {
     pub stage_seconds: &'a BTreeMap<String, f64>,
 }
 
-/// How an attempt ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum AttemptOutcome<'a> {
-    /// Its result is committed.
-    Done,
-    /// Given back through no fault of the frame.
-    Released(&'a str),
-    /// The job was cancelled.
-    Cancelled,
-    /// It failed.
-    Failed(FailureKind, &'a str),
-}
-
 impl FrameRecord {
     /// Where the frame is.
-    pub fn state(&self) -> Result<FrameState, StoreError> {
-        FrameState::from_label(&self.state)
-            .ok_or_else(|| StoreError::Value { place: "frames.state", value: self.state.clone() })
+    pub fn state(&self) -> Result<TaskState, StoreError> {
+        self.task.state()
     }
 
     /// What a worker gets.
     pub fn request(&self) -> Result<FrameJob, StoreError> {
         FrameJob::decode(self.request.as_slice())
-            .map_err(|error| StoreError::Value { place: "frames.request", value: error.to_string() })
+            .map_err(|error| StoreError::Value { place: "tasks.request", value: error.to_string() })
     }
 
     /// What the queue must know.
-    pub fn history(&self) -> Result<FrameHistory, StoreError> {
-        let excluded: BTreeSet<String> = serde_json::from_str(&self.excluded)
-            .map_err(|_| StoreError::Value { place: "frames.excluded", value: self.excluded.clone() })?;
-        Ok(FrameHistory { attempts: self.attempts, failures: self.failures, excluded })
+    pub fn history(&self) -> Result<TaskHistory, StoreError> {
+        self.task.history()
     }
 
     /// The committed result.
@@ -118,7 +96,7 @@ impl FrameRecord {
 }
 
 /// Every frame of a job, in order.
-const FRAMES: &str = "SELECT * FROM frames WHERE job_id = ? ORDER BY frame";
+const FRAMES: &str = "SELECT * FROM tasks WHERE job_id = ? AND kind = 'frame' ORDER BY number";
 
 impl Store {
     /// The views of a job, in order.
@@ -148,6 +126,16 @@ impl Store {
         Ok(rows.into_iter().map(record).collect())
     }
 
+    /// The stored images of one view with their frames, in order.
+    pub async fn images_of_view(&self, job: &str, position: u32) -> Result<Vec<(u32, Blob)>, StoreError> {
+        let sql = "SELECT frame, image_digest, image_size FROM images WHERE job_id = ? AND position = ? \
+                   ORDER BY frame";
+        let query = sqlx::query_as(sql).bind(job).bind(position);
+        let rows: Vec<(u32, String, i64)> = query.fetch_all(&self.pool).await?;
+        let image = |(frame, digest, size)| (frame, Blob { digest, size: unsigned(size) });
+        Ok(rows.into_iter().map(image).collect())
+    }
+
     /// Every frame of a job that was published, in order.
     pub async fn frames(&self, job: &str) -> Result<Vec<FrameRecord>, StoreError> {
         Ok(sqlx::query_as(FRAMES).bind(job).fetch_all(&self.pool).await?)
@@ -155,36 +143,16 @@ impl Store {
 
     /// One frame.
     pub async fn frame(&self, job: &str, frame: u32) -> Result<Option<FrameRecord>, StoreError> {
-        let query =
-            sqlx::query_as("SELECT * FROM frames WHERE job_id = ? AND frame = ?").bind(job).bind(frame);
+        let sql = "SELECT * FROM tasks WHERE job_id = ? AND kind = 'frame' AND number = ?";
+        let query = sqlx::query_as(sql).bind(job).bind(frame);
         Ok(query.fetch_optional(&self.pool).await?)
     }
 
     /// Whether a job has a frame that is done.
     pub async fn has_finished_frame(&self, job: &str) -> Result<bool, StoreError> {
-        let sql = "SELECT EXISTS (SELECT 1 FROM frames WHERE job_id = ? AND state = 'done')";
+        let sql =
+            "SELECT EXISTS (SELECT 1 FROM tasks WHERE job_id = ? AND kind = 'frame' AND state = 'done')";
         Ok(sqlx::query_scalar(sql).bind(job).fetch_one(&self.pool).await?)
-    }
-
-    /// Whether a lease's result was committed, for a report that comes again.
-    pub async fn was_committed(&self, lease_id: &str, attempt: u32) -> Result<bool, StoreError> {
-        let sql = "SELECT COUNT(*) FROM attempts WHERE lease_id = ? AND attempt = ? AND outcome = 'done'";
-        let query = sqlx::query_scalar(sql).bind(lease_id).bind(attempt);
-        let count: i64 = query.fetch_one(&self.pool).await?;
-        Ok(count > 0)
-    }
-
-    /// Kind and message of a frame's last failed attempt.
-    pub async fn last_failure(
-        &self,
-        job: &str,
-        frame: u32,
-    ) -> Result<Option<(FailureKind, String)>, StoreError> {
-        let sql = "SELECT outcome, message FROM attempts WHERE job_id = ? AND frame = ? \
-                   AND outcome NOT IN ('running', 'done', 'released', 'cancelled') ORDER BY attempt DESC LIMIT 1";
-        let query = sqlx::query_as(sql).bind(job).bind(frame);
-        let row: Option<(String, String)> = query.fetch_optional(&self.pool).await?;
-        Ok(row.map(|(kind, message)| (FailureKind::from_label(&kind), message)))
     }
 }
 
@@ -229,74 +197,11 @@ impl Change {
 
     /// A frame becomes ready for the first time. A frame that is there already keeps its state.
     pub async fn publish_frame(&mut self, request: &FrameJob, result_key: &str) -> Result<(), StoreError> {
-        let sql = "INSERT INTO frames (job_id, frame, state, request, result_key, changed_at) \
-                   VALUES (?, ?, 'ready', ?, ?, strftime('%Y-%m-%dT%H:%M:%fZ', 'now')) \
-                   ON CONFLICT (job_id, frame) DO UPDATE SET request = excluded.request";
+        let sql = "INSERT INTO tasks (job_id, kind, number, state, request, result_key, changed_at) \
+                   VALUES (?, 'frame', ?, 'ready', ?, ?, strftime('%Y-%m-%dT%H:%M:%fZ', 'now')) \
+                   ON CONFLICT (job_id, kind, number) DO UPDATE SET request = excluded.request";
         let query = sqlx::query(sql).bind(&request.job_id).bind(request.frame);
         query.bind(request.encode_to_vec()).bind(result_key).execute(&mut *self.transaction).await?;
-        Ok(())
-    }
-
-    /// A frame's new state.
-    pub async fn set_frame_state(
-        &mut self,
-        job: &str,
-        frame: u32,
-        state: FrameState,
-    ) -> Result<(), StoreError> {
-        let sql = "UPDATE frames SET state = ?, changed_at = strftime('%Y-%m-%dT%H:%M:%fZ', 'now') \
-                   WHERE job_id = ? AND frame = ?";
-        let query = sqlx::query(sql).bind(state.label()).bind(job).bind(frame);
-        query.execute(&mut *self.transaction).await?;
-        Ok(())
-    }
-
-    /// A worker got the lease of a frame.
-    pub async fn grant(&mut self, lease: &Lease) -> Result<(), StoreError> {
-        let (job, frame) = (&*lease.key.job, lease.key.frame);
-        self.set_frame_state(job, frame, FrameState::Leased).await?;
-        let sql = "UPDATE frames SET attempts = ?, worker = ? WHERE job_id = ? AND frame = ?";
-        let query = sqlx::query(sql).bind(lease.attempt).bind(&lease.worker_id).bind(job).bind(frame);
-        query.execute(&mut *self.transaction).await?;
-        let sql = "INSERT INTO attempts (job_id, frame, attempt, lease_id, worker, granted_at) \
-                   VALUES (?, ?, ?, ?, ?, strftime('%Y-%m-%dT%H:%M:%fZ', 'now'))";
-        let query = sqlx::query(sql).bind(job).bind(frame).bind(lease.attempt).bind(&lease.id);
-        query.bind(&lease.worker_id).execute(&mut *self.transaction).await?;
-        Ok(())
-    }
-
-    /// An attempt ended.
-    pub async fn end_attempt(
-        &mut self,
-        lease_id: &str,
-        outcome: AttemptOutcome<'_>,
-    ) -> Result<(), StoreError> {
-        let (label, message) = match outcome {
-            AttemptOutcome::Done => ("done", ""),
-            AttemptOutcome::Released(reason) => ("released", reason),
-            AttemptOutcome::Cancelled => ("cancelled", ""),
-            AttemptOutcome::Failed(kind, message) => (kind.label(), message),
-        };
-        let sql = "UPDATE attempts SET outcome = ?, message = ?, \
-                   ended_at = strftime('%Y-%m-%dT%H:%M:%fZ', 'now') WHERE lease_id = ?";
-        let query = sqlx::query(sql).bind(label).bind(message).bind(lease_id);
-        query.execute(&mut *self.transaction).await?;
-        Ok(())
-    }
-
-    /// Counts a failed attempt of a frame; `excluded` names the worker that must not get it again.
-    pub async fn count_failure(
-        &mut self,
-        job: &str,
-        frame: u32,
-        excluded: Option<&str>,
-    ) -> Result<(), StoreError> {
-        // The worker is appended to the JSON list.
-        let sql = "UPDATE frames SET failures = failures + 1, \
-                   excluded = CASE WHEN ?1 = '' THEN excluded ELSE json_insert(excluded, '$[#]', ?1) END \
-                   WHERE job_id = ?2 AND frame = ?3";
-        let query = sqlx::query(sql).bind(excluded.unwrap_or_default()).bind(job).bind(frame);
-        query.execute(&mut *self.transaction).await?;
         Ok(())
     }
 
@@ -307,61 +212,22 @@ impl Change {
         frame: u32,
         result: &CommittedFrame<'_>,
     ) -> Result<(), StoreError> {
-        self.set_frame_state(job, frame, FrameState::Done).await?;
+        self.set_task_state(job, Task::Frame(frame), TaskState::Done).await?;
         let stage_seconds = serde_json::to_string(result.stage_seconds)
-            .map_err(|error| StoreError::Value { place: "frames.stage_seconds", value: error.to_string() })?;
-        let sql = "UPDATE frames SET delta_digest = ?, delta_size = ?, report = ?, worker = ?, seconds = ?, \
-                   stage_seconds = ? WHERE job_id = ? AND frame = ?";
+            .map_err(|error| StoreError::Value { place: "tasks.stage_seconds", value: error.to_string() })?;
+        let sql = "UPDATE tasks SET delta_digest = ?, delta_size = ?, report = ?, worker = ?, seconds = ?, \
+                   stage_seconds = ? WHERE job_id = ? AND kind = 'frame' AND number = ?";
         let query = sqlx::query(sql).bind(&result.delta.digest).bind(signed(result.delta.size));
         let query = query.bind(result.report).bind(result.worker).bind(result.seconds).bind(stage_seconds);
         query.bind(job).bind(frame).execute(&mut *self.transaction).await?;
         Ok(())
     }
 
-    /// Gives the failed and cancelled frames of a job all their attempts again. Returns them.
-    pub async fn reopen_frames(&mut self, job: &str) -> Result<Vec<u32>, StoreError> {
-        let sql = "UPDATE frames SET state = 'ready', failures = 0, excluded = '[]', \
-                   changed_at = strftime('%Y-%m-%dT%H:%M:%fZ', 'now') \
-                   WHERE job_id = ? AND state IN ('failed', 'cancelled') RETURNING frame";
-        Ok(sqlx::query_scalar(sql).bind(job).fetch_all(&mut *self.transaction).await?)
-    }
-
     /// The result of a frame is gone: it is ready again, with all its attempts.
     pub async fn lose_result(&mut self, job: &str, frame: u32) -> Result<(), StoreError> {
-        self.set_frame_state(job, frame, FrameState::Ready).await?;
-        let sql = "UPDATE frames SET failures = 0, excluded = '[]', delta_digest = '', delta_size = 0, report = '', \
-                   seconds = 0, stage_seconds = '{}' WHERE job_id = ? AND frame = ?";
+        let sql = "UPDATE tasks SET delta_digest = '', delta_size = 0, report = '', seconds = 0, stage_seconds = '{}' \
+                   WHERE job_id = ? AND kind = 'frame' AND number = ?";
         sqlx::query(sql).bind(job).bind(frame).execute(&mut *self.transaction).await?;
-        self.append_ready_event(job, frame).await
-    }
-
-    /// Leases of a coordinator that is gone: `(job, frame, attempt, lease, worker)`.
-    pub async fn orphaned_leases(&mut self) -> Result<Vec<(String, u32, u32, String, String)>, StoreError> {
-        let sql = "SELECT job_id, frame, attempt, lease_id, worker FROM attempts WHERE outcome = 'running' \
-                   ORDER BY job_id, frame";
-        Ok(sqlx::query_as(sql).fetch_all(&mut *self.transaction).await?)
-    }
-}
-
-impl Change {
-    /// A lease is void through no fault of the frame: it is ready again.
-    pub async fn release_frame(
-        &mut self,
-        job: &str,
-        frame: u32,
-        attempt: u32,
-        worker: &str,
-    ) -> Result<(), StoreError> {
-        self.set_frame_state(job, frame, FrameState::Ready).await?;
-        let event = super::events::FrameEvent { frame, attempt, worker, ..Default::default() };
-        self.append_frame_event(job, FrameState::Ready, &event).await?;
-        Ok(())
-    }
-
-    /// Appends that a frame waits for a worker.
-    pub async fn append_ready_event(&mut self, job: &str, frame: u32) -> Result<(), StoreError> {
-        let event = super::events::FrameEvent { frame, ..Default::default() };
-        self.append_frame_event(job, FrameState::Ready, &event).await?;
-        Ok(())
+        self.reopen_task(job, Task::Frame(frame)).await
     }
 }

@@ -127,7 +127,8 @@ impl Store {
 
     /// Every job with its frame counts, oldest first.
     pub async fn summaries(&self) -> Result<Vec<Summary>, StoreError> {
-        let sql = "SELECT job_id, SUM(state = 'done'), SUM(state = 'failed') FROM frames GROUP BY job_id";
+        let sql = "SELECT job_id, SUM(state = 'done'), SUM(state = 'failed') FROM tasks \
+                   WHERE kind = 'frame' GROUP BY job_id";
         let counts: Vec<(String, u32, u32)> = sqlx::query_as(sql).fetch_all(&self.pool).await?;
         let counts: BTreeMap<String, (u32, u32)> =
             counts.into_iter().map(|(job, done, failed)| (job, (done, failed))).collect();

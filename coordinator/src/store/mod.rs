@@ -4,6 +4,7 @@ mod artifacts;
 mod events;
 mod frames;
 mod jobs;
+mod tasks;
 #[cfg(test)]
 mod tests;
 mod workers;
@@ -16,11 +17,12 @@ use sqlx::{
 };
 use thiserror::Error;
 
-pub(crate) use self::events::FrameEvent;
+pub(crate) use self::events::TaskEvent;
 pub use self::{
     artifacts::Artifact,
-    frames::{AttemptOutcome, CommittedFrame, FrameRecord, ImageRecord, ViewRecord},
+    frames::{CommittedFrame, FrameRecord, ImageRecord, ViewRecord},
     jobs::{JobRecord, NewJob, Summary},
+    tasks::{AttemptOutcome, OrphanedLease, TaskRecord},
     workers::WorkerRecord,
 };
 

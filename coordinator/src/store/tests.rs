@@ -8,7 +8,7 @@ use std::{
 use trackersplat_proto::v1::{Blob, Failure, FailureKind, FrameJob, Register, job_event::Event};
 
 use super::*;
-use crate::queue::{FrameKey, Lease, Queue, QueuePolicy, SessionId, frame::FrameState, job::JobState};
+use crate::queue::{Lease, Queue, QueuePolicy, SessionId, Task, TaskKey, job::JobState, task::TaskState};
 
 async fn open(folder: &tempfile::TempDir) -> Store {
     Store::open(&folder.path().join("state.sqlite")).await.unwrap()
@@ -33,8 +33,8 @@ fn lease(job: &str, frame: u32, attempts: u32) -> Lease {
     let lease_duration = Duration::from_secs(1);
     let policy = QueuePolicy { max_attempts: 3, lease_duration, reconnect_grace: Duration::ZERO };
     let mut queue = Queue::new(policy);
-    let history = crate::queue::FrameHistory { attempts, ..Default::default() };
-    queue.add(FrameKey { job: job.into(), frame }, history);
+    let history = crate::queue::TaskHistory { attempts, ..Default::default() };
+    queue.add(TaskKey { job: job.into(), task: Task::Frame(frame) }, history);
     let worker = Register { worker_id: "w".into(), ..Register::default() };
     queue.connect(SessionId(1), &worker, Instant::now());
     queue.park(SessionId(1));
@@ -48,7 +48,7 @@ async fn publish(store: &Store, id: &str) {
     for frame in 1..=3 {
         let request = FrameJob { job_id: id.into(), frame, ..FrameJob::default() };
         change.publish_frame(&request, &format!("key-{frame}")).await.unwrap();
-        change.append_ready_event(id, frame).await.unwrap();
+        change.append_ready_event(id, Task::Frame(frame)).await.unwrap();
     }
     change.commit().await.unwrap();
 }
@@ -84,10 +84,10 @@ async fn a_reopened_file_holds_what_was_committed_and_nothing_else() {
     assert_eq!(job.state().unwrap(), JobState::Frames);
     assert_eq!(job.frame_numbers().unwrap(), [1, 2, 3]);
     let frames = store.frames("a").await.unwrap();
-    let states: Vec<FrameState> = frames.iter().map(|frame| frame.state().unwrap()).collect();
-    assert_eq!(states, [FrameState::Done, FrameState::Ready, FrameState::Ready]);
+    let states: Vec<TaskState> = frames.iter().map(|frame| frame.state().unwrap()).collect();
+    assert_eq!(states, [TaskState::Done, TaskState::Ready, TaskState::Ready]);
     assert_eq!(frames[0].delta(), Some(delta));
-    assert_eq!((frames[0].seconds, frames[0].stage_seconds()["refine"]), (1.5, 0.5));
+    assert_eq!((frames[0].task.seconds, frames[0].stage_seconds()["refine"]), (1.5, 0.5));
     assert_eq!(frames[1].request().unwrap().frame, 2);
     assert!(store.was_committed("lease-a-1-0", 1).await.unwrap());
     assert!(!store.was_committed("lease-a-1-0", 2).await.unwrap());
@@ -141,13 +141,15 @@ async fn leases_of_a_coordinator_that_is_gone_are_found_and_void() {
     let store = open(&folder).await;
     let mut change = store.change().await.unwrap();
     let orphans = change.orphaned_leases().await.unwrap();
-    assert_eq!(orphans, [("a".to_owned(), 2, 1, "lease-a-2-0".to_owned(), "w".to_owned())]);
+    let key = TaskKey { job: "a".into(), task: Task::Frame(2) };
+    let orphan = OrphanedLease { id: "lease-a-2-0".into(), key: key.clone(), attempt: 1, worker: "w".into() };
+    assert_eq!(orphans, [orphan]);
     change.end_attempt("lease-a-2-0", AttemptOutcome::Released("restart")).await.unwrap();
-    change.release_frame("a", 2, 1, "w").await.unwrap();
+    change.release_task(&key, 1, "w").await.unwrap();
     assert_eq!(change.orphaned_leases().await.unwrap(), []);
     change.commit().await.unwrap();
     let frame = store.frame("a", 2).await.unwrap().unwrap();
-    assert_eq!(frame.state().unwrap(), FrameState::Ready);
+    assert_eq!(frame.state().unwrap(), TaskState::Ready);
     let history = frame.history().unwrap();
     assert_eq!((history.attempts, history.failures), (1, 0), "a restart is not the frame's fault");
 }
@@ -163,19 +165,19 @@ async fn failures_and_excluded_workers_are_kept_until_the_job_is_submitted_again
         change.grant(&lease).await.unwrap();
         let outcome = AttemptOutcome::Failed(FailureKind::OutOfResources, "1 GiB");
         change.end_attempt(&lease.id, outcome).await.unwrap();
-        change.count_failure("a", 1, Some(worker)).await.unwrap();
+        change.count_failure("a", Task::Frame(1), Some(worker)).await.unwrap();
     }
-    change.count_failure("a", 1, None).await.unwrap();
-    change.set_frame_state("a", 1, FrameState::Failed).await.unwrap();
+    change.count_failure("a", Task::Frame(1), None).await.unwrap();
+    change.set_task_state("a", Task::Frame(1), TaskState::Failed).await.unwrap();
     change.commit().await.unwrap();
     let history = store.frame("a", 1).await.unwrap().unwrap().history().unwrap();
     let excluded = BTreeSet::from(["it's \"small\"".to_owned(), "tiny".to_owned()]);
     assert_eq!((history.attempts, history.failures, history.excluded), (2, 3, excluded));
-    let last = store.last_failure("a", 1).await.unwrap();
+    let last = store.last_failure("a", Task::Frame(1)).await.unwrap();
     assert_eq!(last, Some((FailureKind::OutOfResources, "1 GiB".to_owned())));
 
     let mut change = store.change().await.unwrap();
-    assert_eq!(change.reopen_frames("a").await.unwrap(), [1]);
+    change.reopen_tasks("a").await.unwrap();
     change.commit().await.unwrap();
     let history = store.frame("a", 1).await.unwrap().unwrap().history().unwrap();
     assert_eq!((history.attempts, history.failures, history.excluded.len()), (2, 0, 0));
@@ -191,7 +193,7 @@ async fn artifacts_workers_and_counts_are_remembered() {
     let mut change = store.change().await.unwrap();
     change.put_artifact("k", "tracks", &artifact).await.unwrap();
     change.worker_connected(&register).await.unwrap();
-    change.set_frame_state("a", 3, FrameState::Failed).await.unwrap();
+    change.set_task_state("a", Task::Frame(3), TaskState::Failed).await.unwrap();
     change.add_stage_seconds("a", "tracking", 1.0).await.unwrap();
     change.add_stage_seconds("a", "tracking", 0.5).await.unwrap();
     change.commit().await.unwrap();

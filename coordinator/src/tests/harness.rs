@@ -17,10 +17,11 @@ use tokio_stream::{StreamExt, wrappers::ReceiverStream};
 use tokio_util::sync::CancellationToken;
 use tonic::{Status, Streaming, transport::Channel};
 use trackersplat_proto::v1::{
-    Blob, CoordinatorMessage, Failure, FailureKind, FrameState, GetBlobRequest, JobEvent, JobState, Lease,
+    Blob, CoordinatorMessage, Failure, FailureKind, FrameJob, GetBlobRequest, JobEvent, JobState, Lease,
     LeaseRequest, PutBlobChunk, Register, Report, ReportReceipt, SubmitRequest, SubmitResponse, Success,
-    WatchRequest, Welcome, WorkerMessage, blobs_client::BlobsClient, coordinator_message, job_event::Event,
-    jobs_client::JobsClient, report::Outcome, worker_message, workers_client::WorkersClient,
+    TaskState, TrackJob, WatchRequest, Welcome, WorkerMessage, blobs_client::BlobsClient,
+    coordinator_message, job_event::Event, jobs_client::JobsClient, lease, report::Outcome, worker_message,
+    workers_client::WorkersClient,
 };
 
 use crate::{Running, ServeError, ServeOptions, hub::Hub, serve};
@@ -195,15 +196,31 @@ impl Bench {
 
     /// What an honest worker reports: the static model, moved.
     pub(super) async fn result(&self, lease: &Lease) -> Success {
-        let static_blob = lease.job.as_ref().unwrap().static_model.clone().unwrap();
+        let static_blob = frame_job(lease).static_model.unwrap();
         let static_model = ply::parse_ply(&self.get(&static_blob.digest).await.unwrap()).unwrap();
-        let moved = model(lease.job.as_ref().unwrap().frame as f32);
+        let moved = model(frame_job(lease).frame as f32);
         let delta = delta::encode(&static_model, &digest_bytes(&static_blob.digest), &moved);
         Success {
             delta: Some(self.put(delta).await),
             report_json: serde_json::to_string(&FrameReport::default()).unwrap(),
             seconds: vec![],
         }
+    }
+}
+
+/// The frame that a lease is for.
+pub(super) fn frame_job(lease: &Lease) -> FrameJob {
+    match lease.task.clone() {
+        Some(lease::Task::Frame(job)) => job,
+        other => panic!("no frame: {other:?}"),
+    }
+}
+
+/// The tracks that a lease is for.
+pub(super) fn track_job(lease: &Lease) -> TrackJob {
+    match lease.task.clone() {
+        Some(lease::Task::Tracks(job)) => job,
+        other => panic!("no tracks: {other:?}"),
     }
 }
 
@@ -237,7 +254,7 @@ impl Watch {
     }
 
     /// Waits for a frame to reach a state; the failure that came with it.
-    pub(super) async fn frame(&mut self, frame: u32, state: FrameState) -> Option<Failure> {
+    pub(super) async fn frame(&mut self, frame: u32, state: TaskState) -> Option<Failure> {
         let event = self
             .until(|event| matches!(event, Event::FrameState(f) if f.frame == frame && f.state() == state && f.attempt > 0))
             .await;
@@ -248,8 +265,9 @@ impl Watch {
 
 /// Stored events only: those that are replayed.
 pub(super) fn stored(events: &[JobEvent]) -> Vec<JobEvent> {
-    let is_stored =
-        |event: &&JobEvent| matches!(event.event, Some(Event::JobState(_) | Event::FrameState(_)));
+    let is_stored = |event: &&JobEvent| {
+        matches!(event.event, Some(Event::JobState(_) | Event::FrameState(_) | Event::TracksState(_)))
+    };
     events.iter().filter(is_stored).cloned().collect()
 }
 
@@ -334,7 +352,7 @@ impl Worker {
         let success = bench.result(&lease).await;
         let receipt = self.report(&lease, Outcome::Success(success)).await;
         assert!(receipt.accepted, "{receipt:?}");
-        lease.job.unwrap().frame
+        frame_job(&lease).frame
     }
 
     /// Whether the stream is closed from the other side.

@@ -3,7 +3,7 @@
 use splat::formats::ply;
 use tonic::Code;
 use trackersplat_proto::v1::{
-    CancelRequest, FailureKind, FetchRequest, FrameState, JobState, ListRequest, SubmitRequest, WatchRequest,
+    CancelRequest, FailureKind, FetchRequest, JobState, ListRequest, SubmitRequest, TaskState, WatchRequest,
     coordinator_message, job_event::Event,
 };
 
@@ -51,7 +51,7 @@ async fn the_frame_job_says_everything_a_worker_needs() {
     let bench = Bench::start().await;
     let job = bench.submitted().await;
     let mut worker = bench.worker("w").await;
-    let key = worker.lease().await.job.unwrap();
+    let key = frame_job(&worker.lease().await);
     assert_eq!((key.job_id, key.frame, key.key_frame), (job, 1, true));
     let names = |views: &[trackersplat_proto::v1::FrameView]| {
         views.iter().map(|view| view.name.clone()).collect::<Vec<_>>()
@@ -67,7 +67,7 @@ async fn the_frame_job_says_everything_a_worker_needs() {
     assert_eq!(camera.rotation, [1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]);
     assert_eq!((camera.width, camera.height, camera.fx), (8, 6, 10.0));
     let mut second = bench.worker("v").await;
-    assert!(!second.lease().await.job.unwrap().key_frame);
+    assert!(!frame_job(&second.lease().await).key_frame);
 }
 
 #[tokio::test]
@@ -223,19 +223,22 @@ async fn a_static_model_with_nan_fails_the_job_and_names_the_file() {
     assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::BadInput));
     assert!(failure.message.contains("nan.ply"), "{}", failure.message);
     let events = bench.watch(&job, 0).await.rest().await;
-    let frame_done = |event: &Event| matches!(event, Event::FrameState(f) if f.state() == FrameState::Done);
+    let frame_done = |event: &Event| matches!(event, Event::FrameState(f) if f.state() == TaskState::Done);
     assert!(!events.iter().filter_map(|event| event.event.as_ref()).any(frame_done));
 }
 
 #[tokio::test]
 async fn tracks_lead_from_the_key_frame_to_every_other_frame_of_the_training_views() {
+    let in_frames =
+        |event: &Event| matches!(event, Event::JobState(changed) if changed.state() == JobState::Frames);
     let bench = Bench::start().await;
     let request = SubmitRequest { settings_json: String::new(), ..bench.request() };
-    bench.submit(request.clone()).await.unwrap();
+    let job = bench.submit(request.clone()).await.unwrap().job_id;
+    bench.watch(&job, 0).await.until(in_frames).await;
     let (mut first, mut second) = (bench.worker("a").await, bench.worker("b").await);
-    let key = first.lease().await.job.unwrap();
+    let key = frame_job(&first.lease().await);
     assert!(key.key_frame && key.training_views.iter().all(|view| view.tracks.is_none()));
-    let other = second.lease().await.job.unwrap();
+    let other = frame_job(&second.lease().await);
     assert!(other.test_views.iter().all(|view| view.tracks.is_none()));
     let mut digests = Vec::new();
     for view in &other.training_views {
@@ -251,8 +254,6 @@ async fn tracks_lead_from_the_key_frame_to_every_other_frame_of_the_training_vie
         SubmitRequest { settings_json: r#"{"seed": 1}"#.into(), output: bench.path("out2"), ..request };
     let seeded = bench.submit(seeded).await.unwrap().job_id;
     let mut watch = bench.watch(&seeded, 0).await;
-    let in_frames =
-        |event: &Event| matches!(event, Event::JobState(changed) if changed.state() == JobState::Frames);
     watch
         .until(|event| {
             assert!(!matches!(event, Event::Progress(p) if p.stage == "tracking"), "tracked again");

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tonic::Code;
 use trackersplat_proto::v1::{
-    Blob, FailureKind, FrameState, GoingAway, Heartbeat, JobState, Register, Report, Success,
+    Blob, FailureKind, GoingAway, Heartbeat, JobState, Register, Report, Success, TaskState,
     coordinator_message, job_event::Event, report::Outcome, worker_message,
 };
 
@@ -40,7 +40,7 @@ async fn a_lease_request_waits_until_there_is_work() {
     worker.ask().await;
     assert_eq!(worker.welcome.heartbeat_interval_ms, 20);
     let job = bench.submitted().await;
-    assert_eq!(worker.leased().await.job.unwrap().job_id, job);
+    assert_eq!(frame_job(&worker.leased().await).job_id, job);
 }
 
 #[tokio::test]
@@ -78,7 +78,7 @@ async fn a_silent_workers_lease_expires_and_its_report_is_refused() {
     let mut silent = bench.worker("silent").await;
     let lease = silent.lease().await;
     let mut watch = bench.watch(&job, 0).await;
-    let failure = watch.frame(1, FrameState::Ready).await.unwrap();
+    let failure = watch.frame(1, TaskState::Ready).await.unwrap();
     assert_eq!(failure.kind(), FailureKind::LostWorker);
     assert!(failure.message.contains("silent"), "{}", failure.message);
     match silent.receive().await.unwrap() {
@@ -134,11 +134,11 @@ async fn a_broken_stream_gives_the_frame_to_another_worker_after_the_grace() {
     let mut other = bench.worker("other").await;
     drop(lost);
     let mut watch = bench.watch(&job, 0).await;
-    let failure = watch.frame(1, FrameState::Ready).await.unwrap();
+    let failure = watch.frame(1, TaskState::Ready).await.unwrap();
     assert_eq!(failure.kind(), FailureKind::LostWorker);
     assert!(failure.message.contains("lost broke"), "{}", failure.message);
     let lease = other.lease().await;
-    assert_eq!((lease.job.unwrap().frame, lease.attempt), (1, 2));
+    assert_eq!((frame_job(&lease).frame, lease.attempt), (1, 2));
 }
 
 #[tokio::test]
@@ -154,7 +154,7 @@ async fn a_worker_that_comes_back_keeps_its_lease_and_its_result_counts() {
     let mut worker = Worker::say(bench.channel.clone().unwrap(), again).await.unwrap();
     assert!(worker.report(&lease, Outcome::Success(success)).await.accepted);
     let mut watch = bench.watch(&job, 0).await;
-    let done = |event: &Event| matches!(event, Event::FrameState(f) if f.state() == FrameState::Done);
+    let done = |event: &Event| matches!(event, Event::FrameState(f) if f.state() == TaskState::Done);
     let Some(Event::FrameState(done)) = watch.until(done).await.event else { panic!("not a frame") };
     assert_eq!((done.frame, done.attempt), (1, 1));
 }
@@ -168,7 +168,7 @@ async fn bad_results_are_refused_and_three_of_them_fail_the_frame_and_the_job() 
     let absent = Blob { digest: "ab".repeat(32), size: 3 };
     for (attempt, delta) in [(1, Some(garbage)), (2, Some(absent)), (3, None)] {
         let lease = worker.lease().await;
-        assert_eq!((lease.attempt, lease.job.as_ref().unwrap().frame), (attempt, 1));
+        assert_eq!((lease.attempt, frame_job(&lease).frame), (attempt, 1));
         let honest = bench.result(&lease).await;
         let receipt = worker.report(&lease, Outcome::Success(Success { delta, ..honest })).await;
         assert!(!receipt.accepted && !receipt.reason.is_empty(), "{receipt:?}");
@@ -238,7 +238,7 @@ async fn a_failed_attempt_is_tried_again_bad_input_is_not() {
     let lease = worker.lease().await;
     assert!(worker.fail(&lease, FailureKind::Transient).await.accepted);
     let lease = worker.lease().await;
-    assert_eq!((lease.job.as_ref().unwrap().frame, lease.attempt), (1, 2));
+    assert_eq!((frame_job(&lease).frame, lease.attempt), (1, 2));
     assert!(worker.fail(&lease, FailureKind::BadInput).await.accepted);
     assert_eq!(worker.work_once(&bench).await, 2);
     assert_eq!(worker.work_once(&bench).await, 3);
@@ -253,13 +253,13 @@ async fn out_of_resources_goes_to_another_worker_only() {
     let mut small = bench.worker("small").await;
     let lease = small.lease().await;
     small.fail(&lease, FailureKind::OutOfResources).await;
-    assert_eq!(small.lease().await.job.unwrap().frame, 2);
+    assert_eq!(frame_job(&small.lease().await).frame, 2);
     let mut watch = bench.watch(&job, 0).await;
     watch
         .until(|event| matches!(event, Event::Workers(w) if w.connected == 1 && w.waiting_frames == 1))
         .await;
     let mut large = bench.worker("large").await;
-    assert_eq!(large.lease().await.job.unwrap().frame, 1);
+    assert_eq!(frame_job(&large.lease().await).frame, 1);
 }
 
 #[tokio::test]
@@ -283,10 +283,10 @@ async fn a_draining_worker_gives_its_frame_back_without_a_failure() {
     draining.lease().await;
     draining.send(worker_message::Message::GoingAway(GoingAway { reason: "SIGTERM".into() })).await;
     let mut watch = bench.watch(&job, 0).await;
-    assert_eq!(watch.frame(1, FrameState::Ready).await, None);
+    assert_eq!(watch.frame(1, TaskState::Ready).await, None);
     assert_eq!(draining.end().await.map(|status| status.code()), None);
     let lease = bench.worker("other").await.lease().await;
-    assert_eq!((lease.job.unwrap().frame, lease.attempt), (1, 2));
+    assert_eq!((frame_job(&lease).frame, lease.attempt), (1, 2));
 }
 
 #[tokio::test]
@@ -319,7 +319,7 @@ async fn a_second_process_with_the_same_name_replaces_the_first() {
     let mut second = bench.worker("w").await;
     assert_eq!(first.end().await.unwrap().code(), Code::FailedPrecondition);
     let lease = second.lease().await;
-    assert_eq!((lease.job.unwrap().frame, lease.attempt), (1, 2));
+    assert_eq!((frame_job(&lease).frame, lease.attempt), (1, 2));
 }
 
 #[tokio::test]

@@ -2,10 +2,12 @@
 
 mod harness;
 mod jobs;
+mod learned;
 mod leases;
 mod ownership;
 mod remote_clips;
 mod reports;
 mod restart;
 mod runs;
+mod tracks;
 mod transfers;

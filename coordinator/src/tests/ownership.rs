@@ -88,7 +88,7 @@ async fn a_run_replaces_what_an_earlier_run_left_behind_without_a_finished_frame
     assert_eq!(owner(&bench), job);
     let mut worker = bench.worker("w").await;
     let lease = worker.lease().await;
-    assert_eq!(lease.job.as_ref().unwrap().job_id, job);
+    assert_eq!(frame_job(&lease).job_id, job);
     let success = bench.result(&lease).await;
     let outcome = trackersplat_proto::v1::report::Outcome::Success(success);
     assert!(worker.report(&lease, outcome).await.accepted);

@@ -4,7 +4,7 @@
 use tokio::sync::mpsc;
 use tonic::Status;
 use trackersplat_proto::v1::{
-    CoordinatorMessage, FailureKind, FrameState, Lease, Register, Report, coordinator_message::Message,
+    CoordinatorMessage, FailureKind, Lease, Register, Report, TaskState, coordinator_message::Message,
     report::Outcome,
 };
 
@@ -81,9 +81,9 @@ fn a_report_sent_again_while_it_is_verified_is_verified_once_and_answered_when_i
             Message::Receipt(receipt) => assert!(receipt.accepted, "{receipt:?}"),
             other => panic!("{other:?}"),
         }
-        assert_eq!(back.lease(&hub).await.job.unwrap().frame, 2, "the job goes on");
+        assert_eq!(frame_job(&back.lease(&hub).await).frame, 2, "the job goes on");
         let frame = hub.store.frame(&job, 1).await.unwrap().unwrap();
-        assert_eq!(frame.state().unwrap(), crate::queue::frame::FrameState::Done);
+        assert_eq!(frame.state().unwrap(), crate::queue::task::TaskState::Done);
     });
 }
 
@@ -109,10 +109,10 @@ fn a_report_whose_verification_panicked_is_a_failed_attempt() {
         release.send(()).unwrap();
         held_up.await.unwrap().unwrap();
         hub.report_panicked(session).await.unwrap();
-        let failure = bench.watch(&job, 0).await.frame(1, FrameState::Ready).await.unwrap();
+        let failure = bench.watch(&job, 0).await.frame(1, TaskState::Ready).await.unwrap();
         assert_eq!(failure.kind(), FailureKind::Bug);
         match stream.receive().await {
-            Message::Lease(lease) => assert_eq!((lease.job.unwrap().frame, lease.attempt), (1, 2)),
+            Message::Lease(lease) => assert_eq!((frame_job(&lease).frame, lease.attempt), (1, 2)),
             other => panic!("{other:?}"),
         }
     });

@@ -1,6 +1,6 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 
-use trackersplat_proto::v1::{FailureKind, FrameState, JobState, job_event::Event, report::Outcome};
+use trackersplat_proto::v1::{FailureKind, JobState, TaskState, job_event::Event, report::Outcome};
 
 use super::harness::*;
 
@@ -11,12 +11,12 @@ async fn a_restarted_coordinator_goes_on_and_computes_no_finished_frame_twice() 
     let mut worker = bench.worker("w").await;
     assert_eq!(worker.work_once(&bench).await, 1);
     let lease = worker.lease().await;
-    assert_eq!(lease.job.as_ref().unwrap().frame, 2);
+    assert_eq!(frame_job(&lease).frame, 2);
     let success = bench.result(&lease).await;
     let mut watch = bench.watch(&job, 0).await;
     let seen = watch
         .until(
-            |event| matches!(event, Event::FrameState(f) if f.frame == 2 && f.state() == FrameState::Leased),
+            |event| matches!(event, Event::FrameState(f) if f.frame == 2 && f.state() == TaskState::Leased),
         )
         .await;
     bench.stop().await;
@@ -26,7 +26,7 @@ async fn a_restarted_coordinator_goes_on_and_computes_no_finished_frame_twice() 
     let stale = worker.report(&lease, Outcome::Success(success)).await;
     assert!(!stale.accepted, "leases of a coordinator that is gone are void");
     let again = worker.lease().await;
-    assert_eq!((again.job.as_ref().unwrap().frame, again.attempt), (2, 2));
+    assert_eq!((frame_job(&again).frame, again.attempt), (2, 2));
     let success = bench.result(&again).await;
     assert!(worker.report(&again, Outcome::Success(success)).await.accepted);
     assert_eq!(worker.work_once(&bench).await, 3);
@@ -38,7 +38,7 @@ async fn a_restarted_coordinator_goes_on_and_computes_no_finished_frame_twice() 
     assert_eq!(sequences, expected, "the numbers go on across the restart");
     let all = bench.watch(&job, 0).await.rest().await;
     let done_twice = |frame| {
-        let done = |event: &&trackersplat_proto::v1::JobEvent| matches!(&event.event, Some(Event::FrameState(f)) if f.frame == frame && f.state() == FrameState::Done);
+        let done = |event: &&trackersplat_proto::v1::JobEvent| matches!(&event.event, Some(Event::FrameState(f)) if f.frame == frame && f.state() == TaskState::Done);
         all.iter().filter(done).count() != 1
     };
     assert!(![1, 2, 3].into_iter().any(done_twice));

@@ -89,5 +89,5 @@ async fn frames_are_cancelled_as_the_change_that_ends_their_job_sees_them() {
     change.commit().await.unwrap();
     assert_eq!(within(hub.cancel_job(&job)).await.unwrap(), JobState::Cancelled);
     let frames = hub.store.frames(&job).await.unwrap();
-    assert_eq!(frames[0].state().unwrap(), crate::queue::frame::FrameState::Cancelled);
+    assert_eq!(frames[0].state().unwrap(), crate::queue::task::TaskState::Cancelled);
 }

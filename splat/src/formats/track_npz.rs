@@ -12,6 +12,8 @@
 //! key-frame pixel in every frame, in pixels with the centre of the top-left pixel at (0.5, 0.5); `visible` or
 //! `visibility` `[T, H, W]` (bool, u8 or float, visible above 0.5); optionally `sigma` `[T, H, W]`, the standard
 //! deviation per axis in pixels. Frame 0 is the key frame.
+//!
+//! [`read_tracks`] also takes what other trackers' programs give: see `conventions.rs`.
 
 use std::{
     fs::File,
@@ -25,8 +27,12 @@ use zip::ZipArchive;
 use super::TrackError;
 use crate::tracking::TrackField;
 
+mod conventions;
+mod grid;
 #[cfg(test)]
 mod tests;
+
+pub use conventions::read_tracks;
 
 /// Smallest standard deviation of imported tracks, pixels: below it interpolation and sampling err more than tracks.
 pub const SIGMA_FLOOR: f32 = 0.05;
@@ -92,7 +98,14 @@ pub fn read_exact_flow(path: &Path) -> Result<Vec<TrackField>, TrackError> {
 /// array they are [`DEFAULT_SIGMA`].
 pub fn read_track_npz(path: &Path) -> Result<Vec<TrackField>, TrackError> {
     let mut archive = Archive::open(path)?;
-    let tracks = archive.floats(&["tracks", "positions"])?;
+    let tracks = archive.floats(&POSITIONS)?;
+    fields_of(&mut archive, &tracks)
+}
+
+/// Names of the array of positions.
+const POSITIONS: [&str; 2] = ["tracks", "positions"];
+
+fn fields_of(archive: &mut Archive<'_>, tracks: &Array<f32>) -> Result<Vec<TrackField>, TrackError> {
     let &[frames, height, width, 2] = &tracks.shape[..] else {
         return Err(archive.shape(&tracks.name, &tracks.shape, "[T, H, W, 2]".into()));
     };

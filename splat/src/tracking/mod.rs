@@ -9,6 +9,8 @@ mod chain;
 mod coarse;
 mod consistency;
 mod flow;
+pub mod learned;
+mod matcher;
 mod pair;
 mod patches;
 mod planes;
@@ -16,9 +18,11 @@ mod refine;
 mod settings;
 #[cfg(test)]
 mod tests;
+mod tracker;
 mod view;
 
 pub use settings::TrackingSettings;
+pub use tracker::Tracker;
 pub use view::track_view;
 
 /// Where each key-frame pixel of one view is at one frame.

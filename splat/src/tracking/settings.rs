@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::learned::OnnxSettings;
 use crate::settings::Quality;
 
 /// How dense tracks are found.
@@ -39,6 +40,8 @@ pub struct TrackingSettings {
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
     pub hidden_sigma: f32,
+    /// How images reach a learned tracker; without effect on the built-in one.
+    pub onnx: OnnxSettings,
 }
 
 impl Default for TrackingSettings {
@@ -65,6 +68,7 @@ impl TrackingSettings {
             correlation: 0.5,
             sigma_floor: 0.1,
             hidden_sigma: 16.0,
+            onnx: OnnxSettings::default(),
         };
         match quality {
             Quality::Draft => Self {

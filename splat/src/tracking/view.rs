@@ -1,13 +1,13 @@
 //! Tracking of one view, frame after frame.
 
-use std::{collections::VecDeque, sync::Arc};
+use std::{collections::VecDeque, convert::Infallible, sync::Arc};
 
 use super::{
     TrackField, TrackingSettings, chain,
     consistency::{self, Judged},
     flow::Flow,
-    pair::{Frame, Guides, match_frames},
-    refine::{Smoothing, refine},
+    matcher::{PairMatcher, PatchSearch, Ways},
+    pair::{Frame, Guides},
 };
 use crate::image::Image;
 
@@ -31,18 +31,49 @@ pub fn track_view<E>(
     settings: &TrackingSettings,
     emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
 ) -> Result<(), E> {
+    let mut loaded = |index: usize| load(index).map_err(Failure::Caller);
+    let mut passed_on = |index: usize, field: TrackField| emit(index, field).map_err(Failure::Caller);
+    track_frames(frame_count, &mut loaded, settings, &PatchSearch, &mut passed_on).map_err(|failure| {
+        match failure {
+            Failure::Caller(error) => error,
+        }
+    })
+}
+
+/// What ends the work when the matcher itself cannot fail.
+enum Failure<E> {
+    Caller(E),
+}
+
+impl<E> From<Infallible> for Failure<E> {
+    fn from(never: Infallible) -> Self {
+        match never {}
+    }
+}
+
+/// [`track_view`] with any matcher of pairs.
+pub(super) fn track_frames<E, M: PairMatcher>(
+    frame_count: usize,
+    load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+    settings: &TrackingSettings,
+    matcher: &M,
+    emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+) -> Result<(), E>
+where
+    E: From<M::Error>,
+{
     if frame_count < 2 {
         return Ok(());
     }
     let key_image = load(0)?;
     let size = (key_image.width, key_image.height);
     let empty = key_image.pixel_count() == 0;
-    let mut tracker = if empty { None } else { Some(Tracker::new(&key_image, settings)) };
+    let mut tracker = if empty { None } else { Some(Tracker::new(&key_image, settings, matcher)) };
     drop(key_image);
     for index in 1..frame_count {
         let image = load(index)?;
         let field = match &mut tracker {
-            Some(tracker) if (image.width, image.height) == size => tracker.track(index, &image),
+            Some(tracker) if (image.width, image.height) == size => tracker.track(index, &image)?,
             _ => unknown(size),
         };
         emit(index, field)?;
@@ -51,7 +82,7 @@ pub fn track_view<E>(
 }
 
 /// All pixels hidden, where they were.
-fn unknown((width, height): (u32, u32)) -> TrackField {
+pub(super) fn unknown((width, height): (u32, u32)) -> TrackField {
     let pixels = width as usize * height as usize;
     let centres = (0..height).flat_map(|y| (0..width).map(move |x| [x as f32 + 0.5, y as f32 + 0.5]));
     let sigma = unknown_sigma(width, height);
@@ -69,8 +100,9 @@ fn unknown_sigma(width: u32, height: u32) -> f32 {
     width.max(height).max(1) as f32
 }
 
-struct Tracker<'a> {
+struct Tracker<'a, M> {
     settings: &'a TrackingSettings,
+    matcher: &'a M,
     width: u32,
     height: u32,
     key: Frame,
@@ -78,12 +110,13 @@ struct Tracker<'a> {
     past: VecDeque<Past>,
 }
 
-impl<'a> Tracker<'a> {
-    fn new(key: &Image, settings: &'a TrackingSettings) -> Self {
+impl<'a, M: PairMatcher> Tracker<'a, M> {
+    fn new(key: &Image, settings: &'a TrackingSettings, matcher: &'a M) -> Self {
         let frame = Frame::new(key, settings);
         let key_texture = consistency::texture(&frame);
         Self {
             settings,
+            matcher,
             width: key.width,
             height: key.height,
             key: frame,
@@ -92,11 +125,11 @@ impl<'a> Tracker<'a> {
         }
     }
 
-    fn track(&mut self, index: usize, image: &Image) -> TrackField {
+    fn track(&mut self, index: usize, image: &Image) -> Result<TrackField, M::Error> {
         let frame = Frame::new(image, self.settings);
-        let chains = self.chains(index, &frame);
+        let chains = self.chains(index, &frame)?;
         let guess = (!chains.is_empty()).then(|| chain::choose(&chains));
-        let direct = self.direct(&frame, guess.as_ref());
+        let direct = self.direct(&frame, guess.as_ref())?;
         // The direct match comes first: of equals, the one that cannot have drifted.
         let candidates: Vec<Judged> = std::iter::once(direct).chain(chains).collect();
         let tracks = self.anchored(&frame, chain::choose(&candidates));
@@ -108,46 +141,41 @@ impl<'a> Tracker<'a> {
         while self.past.front().is_some_and(|past| past.index + longest <= index) {
             self.past.pop_front();
         }
-        field
+        Ok(field)
     }
 
     /// The tracks of earlier frames, continued to this one.
-    fn chains(&self, index: usize, frame: &Frame) -> Vec<Judged> {
+    fn chains(&self, index: usize, frame: &Frame) -> Result<Vec<Judged>, M::Error> {
         let earlier =
             self.settings.gaps.iter().filter_map(|&gap| {
                 self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
             });
         let continue_from = |past: &Past| {
-            let (flow, back) = match_frames(&past.frame, frame, None, self.settings);
-            let onward = consistency::judge(&past.frame, frame, flow, &back, &past.texture, self.settings);
+            let Ways { forward, backward } =
+                self.matcher.both_ways(&past.frame, frame, None, self.settings)?;
+            let onward =
+                consistency::judge(&past.frame, frame, forward, &backward, &past.texture, self.settings);
             let mut chained = chain::chain(&past.tracks, &onward);
             consistency::recheck(&self.key, frame, &mut chained, self.settings);
-            chained
+            Ok(chained)
         };
         earlier.map(continue_from).collect()
     }
 
     /// The match of the key frame with this one, helped by the chained tracks.
-    fn direct(&self, frame: &Frame, guess: Option<&Judged>) -> Judged {
+    fn direct(&self, frame: &Frame, guess: Option<&Judged>) -> Result<Judged, M::Error> {
         let back: Option<Flow> = guess.map(chain::inverted);
         let guides = match (guess, &back) {
             (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward }),
             _ => None,
         };
-        let (flow, back) = match_frames(&self.key, frame, guides, self.settings);
-        consistency::judge(&self.key, frame, flow, &back, &self.key_texture, self.settings)
+        let Ways { forward, backward } = self.matcher.both_ways(&self.key, frame, guides, self.settings)?;
+        Ok(consistency::judge(&self.key, frame, forward, &backward, &self.key_texture, self.settings))
     }
 
     /// The tracks, refined once more against the key frame itself.
     fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
-        let smoothing = Smoothing::of(self.settings);
-        let flow = refine(
-            &self.key.reference(0),
-            &frame.reference(0),
-            &tracks.flow,
-            Some(&tracks.visible),
-            smoothing,
-        );
+        let flow = self.matcher.anchored(&self.key, frame, &tracks, self.settings);
         let mut anchored = Judged { flow, ..tracks };
         consistency::widen_at_boundaries(&mut anchored);
         anchored

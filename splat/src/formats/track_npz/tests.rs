@@ -8,19 +8,24 @@ use zip::{ZipWriter, write::SimpleFileOptions};
 use super::*;
 
 /// An npz under construction.
-struct Npz {
+pub(super) struct Npz {
     folder: tempfile::TempDir,
     zip: ZipWriter<File>,
 }
 
 impl Npz {
-    fn new() -> Self {
+    pub(super) fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let zip = ZipWriter::new(File::create(folder.path().join("tracks.npz")).unwrap());
         Self { folder, zip }
     }
 
-    fn array<T: npyz::AutoSerialize + Copy>(self, name: &str, shape: &[u64], values: &[T]) -> Self {
+    pub(super) fn array<T: npyz::AutoSerialize + Copy>(
+        self,
+        name: &str,
+        shape: &[u64],
+        values: &[T],
+    ) -> Self {
         self.ordered(name, shape, values, Order::C)
     }
 
@@ -41,7 +46,7 @@ impl Npz {
         self
     }
 
-    fn finish(self) -> (tempfile::TempDir, PathBuf) {
+    pub(super) fn finish(self) -> (tempfile::TempDir, PathBuf) {
         self.zip.finish().unwrap();
         let path = self.folder.path().join("tracks.npz");
         (self.folder, path)

@@ -1,10 +1,51 @@
-//! The states of a frame as a table.
+//! What workers do, and its states as a table.
 
 use trackersplat_proto::v1;
 
-/// Where a frame is. The table is in `proto/PROTOCOL.md`.
+use super::JobId;
+
+/// A unit of work. Sorts in the order in which tasks are given out: tracks first, as frames wait for them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Task {
+    /// The tracks of the view at this position in the clip.
+    Tracks(u32),
+    /// The frame of this number in the clip.
+    Frame(u32),
+}
+
+impl Task {
+    /// The kind as it stands in the database.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Self::Tracks(_) => "tracks",
+            Self::Frame(_) => "frame",
+        }
+    }
+
+    /// Position of the view, or frame number.
+    pub fn number(self) -> u32 {
+        let (Self::Tracks(number) | Self::Frame(number)) = self;
+        number
+    }
+
+    /// Inverse of [`Task::kind`] and [`Task::number`].
+    pub fn from_row(kind: &str, number: u32) -> Option<Self> {
+        [Self::Tracks(number), Self::Frame(number)].into_iter().find(|task| task.kind() == kind)
+    }
+}
+
+/// One task of one job; sorts by job, then by task.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct TaskKey {
+    /// The job.
+    pub job: JobId,
+    /// Which of its tasks.
+    pub task: Task,
+}
+
+/// Where a task is. The table is in `proto/PROTOCOL.md`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FrameState {
+pub enum TaskState {
     /// Waits for a worker.
     Ready,
     /// A worker holds the lease.
@@ -17,9 +58,9 @@ pub enum FrameState {
     Cancelled,
 }
 
-/// What moves a frame from one state to another.
+/// What moves a task from one state to another.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FrameTrigger {
+pub enum TaskTrigger {
     /// A worker gets the lease.
     Lease,
     /// A verified result is committed: the leaseholder's, or one that was computed before from the same input.
@@ -28,7 +69,7 @@ pub enum FrameTrigger {
     Retry,
     /// No other attempt is due.
     GiveUp,
-    /// The lease is void through no fault of the frame: the worker drains, or the coordinator was restarted.
+    /// The lease is void through no fault of the task: the worker drains, or the coordinator was restarted.
     Release,
     /// The job was cancelled.
     Cancel,
@@ -40,21 +81,21 @@ pub enum FrameTrigger {
 
 /// A transition that the table does not have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("a {state:?} frame has no transition for {trigger:?}")]
-pub struct IllegalFrameTransition {
-    /// Where the frame is.
-    pub state: FrameState,
+#[error("a {state:?} task has no transition for {trigger:?}")]
+pub struct IllegalTaskTransition {
+    /// Where the task is.
+    pub state: TaskState,
     /// What happened.
-    pub trigger: FrameTrigger,
+    pub trigger: TaskTrigger,
 }
 
-impl FrameState {
+impl TaskState {
     /// Every state, in order.
     pub const ALL: [Self; 5] = [Self::Ready, Self::Leased, Self::Done, Self::Failed, Self::Cancelled];
 
     /// The state after a trigger.
-    pub fn after(self, trigger: FrameTrigger) -> Result<Self, IllegalFrameTransition> {
-        use FrameTrigger::{Cancel, Commit, GiveUp, Lease, Lose, Release, Resubmit, Retry};
+    pub fn after(self, trigger: TaskTrigger) -> Result<Self, IllegalTaskTransition> {
+        use TaskTrigger::{Cancel, Commit, GiveUp, Lease, Lose, Release, Resubmit, Retry};
         match (self, trigger) {
             (Self::Ready, Lease) => Ok(Self::Leased),
             (Self::Ready | Self::Leased, Commit) => Ok(Self::Done),
@@ -62,11 +103,11 @@ impl FrameState {
             (Self::Ready | Self::Leased, GiveUp) => Ok(Self::Failed),
             (Self::Ready | Self::Leased, Cancel) => Ok(Self::Cancelled),
             (Self::Failed | Self::Cancelled, Resubmit) | (Self::Done, Lose) => Ok(Self::Ready),
-            (state, trigger) => Err(IllegalFrameTransition { state, trigger }),
+            (state, trigger) => Err(IllegalTaskTransition { state, trigger }),
         }
     }
 
-    /// Whether no worker is to work on the frame any more.
+    /// Whether no worker is to work on the task any more.
     pub fn has_ended(self) -> bool {
         matches!(self, Self::Done | Self::Failed | Self::Cancelled)
     }
@@ -82,19 +123,19 @@ impl FrameState {
         }
     }
 
-    /// Inverse of [`FrameState::label`].
+    /// Inverse of [`TaskState::label`].
     pub fn from_label(label: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|state| state.label() == label)
     }
 
     /// The state on the wire.
-    pub fn to_wire(self) -> v1::FrameState {
+    pub fn to_wire(self) -> v1::TaskState {
         match self {
-            Self::Ready => v1::FrameState::Ready,
-            Self::Leased => v1::FrameState::Leased,
-            Self::Done => v1::FrameState::Done,
-            Self::Failed => v1::FrameState::Failed,
-            Self::Cancelled => v1::FrameState::Cancelled,
+            Self::Ready => v1::TaskState::Ready,
+            Self::Leased => v1::TaskState::Leased,
+            Self::Done => v1::TaskState::Done,
+            Self::Failed => v1::TaskState::Failed,
+            Self::Cancelled => v1::TaskState::Cancelled,
         }
     }
 }
@@ -105,8 +146,8 @@ mod tests {
 
     #[test]
     fn every_transition_is_as_in_the_table_and_no_other_exists() {
-        use FrameState::*;
-        use FrameTrigger::*;
+        use TaskState::*;
+        use TaskTrigger::*;
         let legal = [
             (Ready, Lease, Leased),
             (Ready, Commit, Done),
@@ -121,14 +162,14 @@ mod tests {
             (Cancelled, Resubmit, Ready),
             (Done, Lose, Ready),
         ];
-        for state in FrameState::ALL {
+        for state in TaskState::ALL {
             for trigger in [Lease, Commit, Retry, GiveUp, Release, Cancel, Resubmit, Lose] {
                 let listed = legal.iter().find(|row| row.0 == state && row.1 == trigger).map(|row| row.2);
                 match state.after(trigger) {
                     Ok(next) => assert_eq!(Some(next), listed, "{state:?} {trigger:?}"),
                     Err(error) => {
                         assert_eq!(listed, None, "{state:?} {trigger:?}");
-                        assert_eq!(error, IllegalFrameTransition { state, trigger });
+                        assert_eq!(error, IllegalTaskTransition { state, trigger });
                     }
                 }
             }
@@ -137,9 +178,9 @@ mod tests {
 
     #[test]
     fn labels_name_their_states() {
-        for state in FrameState::ALL {
-            assert_eq!(FrameState::from_label(state.label()), Some(state));
+        for state in TaskState::ALL {
+            assert_eq!(TaskState::from_label(state.label()), Some(state));
         }
-        assert_eq!(FrameState::from_label("lost"), None);
+        assert_eq!(TaskState::from_label("lost"), None);
     }
 }

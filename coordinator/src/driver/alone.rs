@@ -1,0 +1,127 @@
+//! Tracks that no connected worker may make: the coordinator makes them itself, under leases of its own.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use futures::{StreamExt, stream::FuturesUnordered};
+use splat::{
+    formats::track_blob,
+    image::Image,
+    settings::Settings,
+    tracking::{TrackField, Tracker},
+};
+use tokio::runtime::Handle;
+use tokio_util::sync::CancellationToken;
+use trackersplat_proto::v1::{TrackJob, TrackedField};
+
+use super::Job;
+use crate::{compute::go_on, failure::StageError, hub::Hub, queue::Lease};
+
+impl Job {
+    /// Tracks views whenever no connected worker may, until every view is tracked.
+    pub(super) async fn track_alone(&self) -> Result<(), StageError> {
+        let mut changed = self.changed.clone();
+        loop {
+            changed.borrow_and_update();
+            let (done, total) = self.hub.tracks(&self.id, |ledger| ledger.counts()).await?;
+            if done == total {
+                return Ok(());
+            }
+            if self.hub.has_own_work(&self.id).await {
+                let _turn = self.turn().await?;
+                self.track_while_alone().await?;
+                continue;
+            }
+            let woken = self.stop.run_until_cancelled(changed.changed()).await;
+            woken.and_then(Result::ok).ok_or(StageError::Stopped)?;
+        }
+    }
+
+    /// Tracks as many views at a time as the compute pool has threads. Views that are begun are finished, though workers
+    /// may come meanwhile: those take the others.
+    async fn track_while_alone(&self) -> Result<(), StageError> {
+        let mut running = FuturesUnordered::new();
+        loop {
+            while running.len() < self.hub.options.compute_threads
+                && let Some((lease, request)) = self.hub.lease_own(&self.id, &self.stop).await?
+            {
+                running.push(self.track_view(lease, request));
+            }
+            match running.next().await {
+                Some(ended) => ended?,
+                None => return Ok(()),
+            }
+        }
+    }
+
+    async fn track_view(&self, lease: Lease, request: TrackJob) -> Result<(), StageError> {
+        let work = OwnTracking {
+            hub: self.hub.clone(),
+            lease: lease.clone(),
+            request,
+            settings: self.settings.clone(),
+            stop: self.stop.clone(),
+            runtime: Handle::current(),
+        };
+        let ended = match self.hub.compute.run(move || work.run()).await {
+            Ok(()) => Ok(()),
+            Err(StageError::Failed(reason)) => Err(reason),
+            Err(error) => return Err(error),
+        };
+        self.hub.own_ended(&lease, ended).await
+    }
+}
+
+/// The tracks of one view. Runs on threads of the compute pool, where waiting is allowed.
+struct OwnTracking {
+    hub: Arc<Hub>,
+    lease: Lease,
+    request: TrackJob,
+    settings: Arc<Settings>,
+    stop: CancellationToken,
+    runtime: Handle,
+}
+
+impl OwnTracking {
+    fn run(&self) -> Result<(), StageError> {
+        let frames = &self.request.frames;
+        let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
+        let mut load = |index: usize| self.load(index);
+        let mut emit = |index: usize, field: TrackField| self.emit(index, &field);
+        self.tracker()?.track_view(last + 1, &mut load, &self.settings.tracking, &mut emit)
+    }
+
+    fn tracker(&self) -> Result<Tracker, StageError> {
+        let wanted = self.request.tracker.clone().unwrap_or_default();
+        let bytes = match &wanted.model {
+            Some(blob) => Some(self.runtime.block_on(self.hub.blobs.get(blob))?.to_vec()),
+            None => None,
+        };
+        let model = bytes.map(|bytes| (bytes, wanted.model_name.as_str()));
+        Ok(Tracker::new(model, &self.settings.tracking)?)
+    }
+
+    fn load(&self, index: usize) -> Result<Arc<Image>, StageError> {
+        let frame = &self.request.frames[index];
+        let bytes = self.runtime.block_on(self.hub.blobs.get(&frame.image.clone().unwrap_or_default()))?;
+        let image = Image::decode(&bytes).map_err(|error| {
+            let view = &self.request.view;
+            StageError::bad_input(format!("image of view '{view}' at frame {}: {error}", frame.frame))
+        })?;
+        Ok(Arc::new(image))
+    }
+
+    /// Stores and reports a field, unless it is there already.
+    fn emit(&self, index: usize, field: &TrackField) -> Result<(), StageError> {
+        go_on(&self.stop)?;
+        let frame = &self.request.frames[index];
+        if frame.tracks.is_some() {
+            return Ok(());
+        }
+        let encoded = Bytes::from(track_blob::encode(field));
+        self.runtime.block_on(async {
+            let tracks = Some(self.hub.blobs.put(encoded).await?);
+            self.hub.own_field(&self.lease, TrackedField { frame: frame.frame, tracks }).await
+        })
+    }
+}

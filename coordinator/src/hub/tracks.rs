@@ -1,0 +1,329 @@
+//! Tracks of views: given out, reported field by field, complete.
+
+use std::time::Instant;
+
+use splat::formats::track_blob;
+use tokio_util::sync::CancellationToken;
+use trackersplat_proto::v1::{
+    Blob, CancelLease, Failure, FailureKind, FieldReport, TrackJob, Tracked, TrackedField,
+    coordinator_message::Message,
+};
+
+use super::{Desk, Hub};
+use crate::{
+    failure::{StageError, failure},
+    ledger::{Place, TrackLedger},
+    queue::{
+        JobId, Lease, SessionId, Task, TaskKey,
+        task::{TaskState, TaskTrigger},
+    },
+    store::{Artifact, AttemptOutcome, StoreError, TaskEvent, TaskRecord},
+};
+
+impl Hub {
+    /// What is known of a job's tracks from now on; views that lack fields become ready for workers.
+    pub(crate) async fn begin_tracks(
+        &self,
+        job: &JobId,
+        stop: &CancellationToken,
+        ledger: TrackLedger,
+    ) -> Result<(), StageError> {
+        let mut desk = self.desk.lock().await;
+        if stop.is_cancelled() {
+            return Err(StageError::Stopped);
+        }
+        let positions = ledger.positions();
+        let is_missing = |&position: &u32| ledger.missing(position).is_some();
+        let (missing, complete): (Vec<u32>, Vec<u32>) = positions.iter().partition(|p| is_missing(p));
+        let (done, total) = ledger.counts();
+        if let Some(active) = desk.active.get_mut(job) {
+            active.tracks = Some(ledger);
+        }
+        for position in complete {
+            self.settle_tracks(job, position).await?;
+        }
+        if missing.is_empty() {
+            tracing::info!(job_id = %job, "tracks reused");
+        } else {
+            self.progress(job, "tracking", done, total);
+        }
+        for position in missing {
+            self.publish_tracks(&mut desk, job, position).await?;
+        }
+        Ok(self.dispatch(&mut desk).await?)
+    }
+
+    /// Fields that an earlier attempt or another job has made complete a view without a lease.
+    async fn settle_tracks(&self, job: &JobId, position: u32) -> Result<(), StageError> {
+        let key = TaskKey { job: job.clone(), task: Task::Tracks(position) };
+        let Some(record) = self.store.task(&key).await? else { return Ok(()) };
+        if record.state()?.after(TaskTrigger::Commit).is_err() {
+            return Ok(());
+        }
+        let mut change = self.store.change().await?;
+        change.commit_tracks(job, position, 0.0).await?;
+        change.append_task_event(job, TaskState::Done, &TaskEvent::of(key.task)).await?;
+        change.commit().await?;
+        self.tell_stored(job);
+        Ok(())
+    }
+
+    async fn publish_tracks(&self, desk: &mut Desk, job: &JobId, position: u32) -> Result<(), StageError> {
+        let key = TaskKey { job: job.clone(), task: Task::Tracks(position) };
+        let known = self.store.task(&key).await?;
+        let state = known.as_ref().map(TaskRecord::state).transpose()?;
+        let mut change = self.store.change().await?;
+        match state {
+            None => {
+                change.publish_tracks(job, position).await?;
+                change.append_ready_event(job, key.task).await?;
+            }
+            Some(TaskState::Failed) => {
+                drop(change);
+                let (kind, message) = self.store.last_failure(job, key.task).await?.unwrap_or_default();
+                desk.tracks_failed(job, position, &failure(kind, message));
+                return Ok(());
+            }
+            // Its fields were there, and are gone from the store.
+            Some(state) if state.after(TaskTrigger::Lose).is_ok() => {
+                change.reopen_task(job, key.task).await?;
+            }
+            Some(_) => {}
+        }
+        change.commit().await?;
+        self.tell_stored(job);
+        let history = match self.store.task(&key).await? {
+            Some(record) => record.history()?,
+            None => return Ok(()),
+        };
+        desk.queue.add(key, history);
+        Ok(())
+    }
+
+    /// Reads what is known of a job's tracks; fails if a view cannot be tracked.
+    pub(crate) async fn tracks<T>(
+        &self,
+        job: &JobId,
+        read: impl FnOnce(&TrackLedger) -> T,
+    ) -> Result<T, StageError> {
+        let desk = self.desk.lock().await;
+        let ledger = desk.ledger(job).ok_or(StageError::Stopped)?;
+        match ledger.failed() {
+            Some(reason) => Err(StageError::Failed(reason.clone())),
+            None => Ok(read(ledger)),
+        }
+    }
+
+    /// Whether a view of the job is to be tracked by the coordinator itself: no connected worker may.
+    pub(crate) async fn has_own_work(&self, job: &JobId) -> bool {
+        self.desk.lock().await.queue.has_own_work(job)
+    }
+
+    /// The coordinator's own lease of such a view.
+    pub(crate) async fn lease_own(
+        &self,
+        job: &JobId,
+        stop: &CancellationToken,
+    ) -> Result<Option<(Lease, TrackJob)>, StageError> {
+        let mut desk = self.desk.lock().await;
+        if stop.is_cancelled() {
+            return Err(StageError::Stopped);
+        }
+        let id = uuid::Uuid::now_v7().simple().to_string();
+        let Some(lease) = desk.queue.lease_own(job, Instant::now(), id) else { return Ok(None) };
+        self.record_grant(&lease).await?;
+        let position = lease.key.task.number();
+        Ok(desk.track_job(job, position).map(|request| (lease, request)))
+    }
+
+    /// The coordinator has made a field under its own lease.
+    pub(crate) async fn own_field(&self, lease: &Lease, field: TrackedField) -> Result<(), StageError> {
+        self.keep_field(lease, &field).await?.map_err(StageError::Failed)
+    }
+
+    /// The coordinator's own lease has ended.
+    pub(crate) async fn own_ended(
+        &self,
+        lease: &Lease,
+        ended: Result<(), Failure>,
+    ) -> Result<(), StageError> {
+        let stale = match ended {
+            Ok(()) => self.tracked(lease, Tracked::default()).await?,
+            Err(reason) => self.failed(&lease.id, lease.attempt, reason).await?,
+        };
+        if let Some(reason) = stale {
+            tracing::info!(lease_id = lease.id, reason, "own tracks do not count");
+        }
+        let mut desk = self.desk.lock().await;
+        Ok(self.dispatch(&mut desk).await?)
+    }
+
+    /// A worker has stored a field. It is a sign of life as well; a worker that works on a lease it no longer holds, or
+    /// whose field does not verify, is told to stop.
+    pub(crate) async fn field_reported(
+        &self,
+        session: SessionId,
+        report: FieldReport,
+    ) -> Result<(), StoreError> {
+        let FieldReport { lease_id, attempt, field } = report;
+        let held = {
+            let mut desk = self.desk.lock().await;
+            desk.queue.heartbeat(session, &lease_id, attempt, Instant::now()).cloned()
+        };
+        let reason = match held {
+            Err(stale) => stale.to_string(),
+            Ok(lease) => match self.keep_field(&lease, &field.unwrap_or_default()).await? {
+                Ok(()) => return Ok(()),
+                Err(reason) => {
+                    let message = reason.message.clone();
+                    self.failed(&lease_id, attempt, reason).await?.unwrap_or(message)
+                }
+            },
+        };
+        let mut desk = self.desk.lock().await;
+        desk.send(session, Message::CancelLease(CancelLease { lease_id, reason }));
+        self.dispatch(&mut desk).await
+    }
+
+    /// `None` if the tracks of the lease's view are complete, else why they do not count.
+    pub(super) async fn tracked(
+        &self,
+        lease: &Lease,
+        tracked: Tracked,
+    ) -> Result<Option<String>, StoreError> {
+        for field in &tracked.fields {
+            if let Err(reason) = self.keep_field(lease, field).await? {
+                return self.refused(&lease.id, lease.attempt, reason).await;
+            }
+        }
+        let position = lease.key.task.number();
+        let mut desk = self.desk.lock().await;
+        if let Some(frame) = desk.ledger(&lease.key.job).and_then(|ledger| ledger.missing(position)) {
+            drop(desk);
+            let reason =
+                failure(FailureKind::Bug, format!("the worker's report lacks the tracks to frame {frame}"));
+            return self.refused(&lease.id, lease.attempt, reason).await;
+        }
+        match desk.queue.commit(&lease.id, lease.attempt) {
+            Ok(lease) => self.record_tracked(&mut desk, &lease).await.map(|()| None),
+            Err(stale) => {
+                drop(desk);
+                self.stale_success(&lease.id, lease.attempt, &stale).await
+            }
+        }
+    }
+
+    async fn record_tracked(&self, desk: &mut Desk, lease: &Lease) -> Result<(), StoreError> {
+        let (job, position) = (&lease.key.job, lease.key.task.number());
+        let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
+        let mut change = self.store.change().await?;
+        change.end_attempt(&lease.id, AttemptOutcome::Done).await?;
+        change.commit_tracks(job, position, seconds).await?;
+        let event = TaskEvent {
+            attempt: lease.attempt,
+            worker: &lease.worker_id,
+            seconds,
+            ..TaskEvent::of(lease.key.task)
+        };
+        change.append_task_event(job, TaskState::Done, &event).await?;
+        change.commit().await?;
+        let view = desk.view_name(job, position);
+        tracing::info!(
+            job_id = %job, view, attempt = lease.attempt, worker_id = lease.worker_id, seconds, "view tracked"
+        );
+        self.tell_stored(job);
+        desk.changed(job);
+        Ok(())
+    }
+
+    /// Verifies a field and keeps it, unless it is there already or its lease has ended meanwhile. `Err`: the attempt has
+    /// failed, and why.
+    async fn keep_field(
+        &self,
+        lease: &Lease,
+        field: &TrackedField,
+    ) -> Result<Result<(), Failure>, StoreError> {
+        let (job, position) = (&lease.key.job, lease.key.task.number());
+        let placed = {
+            let desk = self.desk.lock().await;
+            desk.placed(job, position, field)
+        };
+        let (place, blob) = match placed {
+            Ok(Some(place)) => (place, field.tracks.clone().unwrap_or_default()),
+            Ok(None) => return Ok(Ok(())),
+            Err(reason) => return Ok(Err(reason)),
+        };
+        if let Err(reason) = self.verify_field(&blob, place.size).await {
+            return Ok(Err(reason));
+        }
+        let mut desk = self.desk.lock().await;
+        // What has changed while the field was verified counts: the lease may be another worker's by now.
+        match (desk.queue.check(&lease.id, lease.attempt), desk.placed(job, position, field)) {
+            (Ok(()), Ok(Some(_))) => {}
+            (Ok(()), Err(reason)) => return Ok(Err(reason)),
+            (Ok(()), Ok(None)) | (Err(_), _) => return Ok(Ok(())),
+        }
+        let mut change = self.store.change().await?;
+        change.put_artifact(&place.key, "tracks", &Artifact { blob, note: String::new() }).await?;
+        change.commit().await?;
+        if let Some(ledger) = desk.ledger_mut(job) {
+            ledger.keep(position, field);
+            let (done, total) = ledger.counts();
+            self.progress(job, "tracking", done, total);
+        }
+        desk.changed(job);
+        Ok(Ok(()))
+    }
+
+    /// The field is what its name says, readable, and of the size of the view.
+    async fn verify_field(&self, blob: &Blob, (width, height): (u32, u32)) -> Result<(), Failure> {
+        let bug = |message: String| failure(FailureKind::Bug, message);
+        let bytes = self.fetched(blob, "the worker's tracks").await?;
+        let decoded = tokio::task::spawn_blocking(move || track_blob::decode(&bytes)).await;
+        let field = decoded
+            .map_err(|error| bug(format!("reading the worker's tracks: {error}")))?
+            .map_err(|error| bug(format!("the worker's tracks: {error}")))?;
+        if (field.width, field.height) != (width, height) {
+            return Err(bug(format!(
+                "the worker's tracks are of {} x {} pixels, the view of {width} x {height}",
+                field.width, field.height
+            )));
+        }
+        Ok(())
+    }
+}
+
+impl Desk {
+    fn ledger(&self, job: &JobId) -> Option<&TrackLedger> {
+        self.active.get(job)?.tracks.as_ref()
+    }
+
+    fn ledger_mut(&mut self, job: &JobId) -> Option<&mut TrackLedger> {
+        self.active.get_mut(job)?.tracks.as_mut()
+    }
+
+    fn placed(&self, job: &JobId, position: u32, field: &TrackedField) -> Result<Option<Place>, Failure> {
+        let ledger = self.ledger(job);
+        let ledger =
+            ledger.ok_or_else(|| failure(FailureKind::Transient, "the job is not ready for results"))?;
+        ledger.place(position, field).map_err(|message| failure(FailureKind::Bug, message))
+    }
+
+    /// What a worker gets that is to track a view.
+    pub(super) fn track_job(&self, job: &JobId, position: u32) -> Option<TrackJob> {
+        self.ledger(job)?.task(position)
+    }
+
+    /// Name of a tracked view; empty if nothing is known of it.
+    pub(super) fn view_name(&self, job: &JobId, position: u32) -> String {
+        self.ledger(job).map_or("", |ledger| ledger.name(position)).to_owned()
+    }
+
+    /// A view cannot be tracked: the job's driver is to fail.
+    pub(super) fn tracks_failed(&mut self, job: &JobId, position: u32, reason: &Failure) {
+        if let Some(ledger) = self.ledger_mut(job) {
+            ledger.fail(position, reason);
+        }
+        self.changed(job);
+    }
+}

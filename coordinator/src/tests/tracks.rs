@@ -1,0 +1,238 @@
+#![allow(clippy::unwrap_used, reason = "tests")]
+//! Tracks of views as tasks: given out, reported field by field, resumed.
+
+use splat::{formats::track_blob, tracking::TrackField};
+use trackersplat_proto::v1::{
+    Blob, CancelLease, FailureKind, FieldReport, JobState, Lease, SubmitRequest, TaskState, Tracked,
+    TrackedField, coordinator_message, job_event::Event, report::Outcome, worker_message,
+};
+
+use super::harness::*;
+
+/// A field of the clip's size whose tracks all move by `x` pixels.
+fn encoded(width: u32, x: f32) -> Vec<u8> {
+    let pixels = width as usize * 6;
+    let centre =
+        |index: usize| [(index % width as usize) as f32 + 0.5, (index / width as usize) as f32 + 0.5];
+    track_blob::encode(&TrackField {
+        width,
+        height: 6,
+        positions: (0..pixels).map(|index| [centre(index)[0] + x, centre(index)[1]]).collect(),
+        visible: vec![true; pixels],
+        sigma: vec![0.5; pixels],
+    })
+}
+
+async fn field(bench: &Bench, frame: u32) -> TrackedField {
+    TrackedField { frame, tracks: Some(bench.put(encoded(8, frame as f32)).await) }
+}
+
+async fn say(worker: &Worker, lease: &Lease, field: TrackedField) {
+    let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
+    let report = FieldReport { lease_id, attempt, field: Some(field) };
+    worker.send(worker_message::Message::Field(report)).await;
+}
+
+async fn cancelled(worker: &mut Worker) -> CancelLease {
+    match worker.receive().await.unwrap() {
+        coordinator_message::Message::CancelLease(cancel) => cancel,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Says the fields to frames 2 and 3 and that the view is complete.
+async fn track_honestly(bench: &Bench, worker: &mut Worker, lease: &Lease) {
+    let fields = vec![field(bench, 2).await, field(bench, 3).await];
+    let receipt = worker.report(lease, Outcome::Tracked(Tracked { fields })).await;
+    assert!(receipt.accepted, "{receipt:?}");
+}
+
+fn tracked_request(bench: &Bench) -> SubmitRequest {
+    SubmitRequest { settings_json: String::new(), ..bench.request() }
+}
+
+/// Workers that are there before the job, so that the coordinator leaves the tracks to them.
+async fn workers<const N: usize>(bench: &Bench) -> [Worker; N] {
+    let mut workers = Vec::new();
+    for index in 0..N {
+        workers.push(bench.worker(&format!("w{index}")).await);
+    }
+    workers.try_into().ok().unwrap()
+}
+
+#[tokio::test]
+async fn a_frame_is_given_out_once_every_view_is_tracked_to_it() {
+    let bench = Bench::start().await;
+    let [mut a, mut b, mut c, mut refiner] = workers(&bench).await;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    let mut leases = Vec::new();
+    for worker in [&mut a, &mut b, &mut c] {
+        leases.push(worker.lease().await);
+    }
+    let views: Vec<String> = leases.iter().map(|lease| track_job(lease).view).collect();
+    assert_eq!(views, ["cam00", "cam01", "cam02"], "the test view is not tracked");
+    let frames: Vec<u32> = track_job(&leases[0]).frames.iter().map(|frame| frame.frame).collect();
+    assert_eq!(frames, [1, 2, 3]);
+    assert_eq!(refiner.work_once(&bench).await, 1, "the key frame needs no tracks");
+
+    refiner.ask().await;
+    let second = field(&bench, 2).await;
+    for (worker, lease) in [(&a, &leases[0]), (&b, &leases[1]), (&c, &leases[2])] {
+        say(worker, lease, second.clone()).await;
+    }
+    let lease = refiner.leased().await;
+    let request = frame_job(&lease);
+    assert_eq!(request.frame, 2);
+    assert!(request.training_views.iter().all(|view| view.tracks == second.tracks));
+    let success = bench.result(&lease).await;
+    assert!(refiner.report(&lease, Outcome::Success(success)).await.accepted);
+
+    let mut watch = bench.watch(&job, 0).await;
+    watch.frame(2, TaskState::Done).await;
+    let listed = bench.jobs().list(trackersplat_proto::v1::ListRequest {}).await.unwrap().into_inner();
+    assert_eq!(listed.jobs[0].state(), JobState::Tracking, "frame 2 is done while frame 3 is not tracked");
+    for (worker, lease) in [(&mut a, &leases[0]), (&mut b, &leases[1]), (&mut c, &leases[2])] {
+        track_honestly(&bench, worker, lease).await;
+    }
+    assert_eq!(refiner.work_once(&bench).await, 3);
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
+}
+
+#[tokio::test]
+async fn tracks_of_a_lost_worker_go_on_with_the_fields_that_it_had_stored() {
+    let mut bench = Bench::start().await;
+    let [lost, mut heir] = workers(&bench).await;
+    let mut lost = lost;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    let lease = lost.lease().await;
+    assert_eq!((track_job(&lease).view.as_str(), lease.attempt), ("cam00", 1));
+    let stored = field(&bench, 2).await;
+    say(&lost, &lease, stored.clone()).await;
+    let mut watch = bench.watch(&job, 0).await;
+    watch.until(|event| matches!(event, Event::Progress(p) if p.stage == "tracking" && p.done == 1)).await;
+    drop(lost);
+    let is_lost =
+        |event: &Event| matches!(event, Event::TracksState(t) if t.view == "cam00" && t.failure.is_some());
+    let event = watch.until(is_lost).await;
+    let Some(Event::TracksState(changed)) = event.event else { panic!("{event:?}") };
+    assert_eq!(changed.failure.unwrap().kind(), FailureKind::LostWorker);
+
+    let again = heir.lease().await;
+    assert_eq!((track_job(&again).view.as_str(), again.attempt), ("cam00", 2));
+    let exists: Vec<Option<Blob>> = track_job(&again).frames.into_iter().map(|frame| frame.tracks).collect();
+    assert_eq!(exists, [None, stored.tracks, None]);
+
+    // So does a coordinator that was killed: its leases are void, the fields are on disk.
+    bench.stop().await;
+    bench.restart().await;
+    let mut heir = bench.worker("w1").await;
+    let stale = Tracked { fields: vec![field(&bench, 3).await] };
+    assert!(!heir.report(&again, Outcome::Tracked(stale.clone())).await.accepted);
+    assert_eq!(bench.ended_tracking(&job, &mut heir).await, ["cam00", "cam01", "cam02"]);
+}
+
+#[tokio::test]
+async fn fields_that_do_not_verify_or_differ_fail_the_attempt() {
+    let bench = Bench::start().await;
+    let [mut worker] = workers(&bench).await;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    let mut watch = bench.watch(&job, 0).await;
+    let large = TrackedField { frame: 2, tracks: Some(bench.put(encoded(9, 1.0)).await) };
+    let lease = worker.lease().await;
+    say(&worker, &lease, large).await;
+    assert!(cancelled(&mut worker).await.reason.contains("9 x 6"));
+    let failed = |event: &Event| matches!(event, Event::TracksState(t) if t.failure.is_some());
+    let event = watch.until(failed).await;
+    let Some(Event::TracksState(changed)) = event.event else { panic!("{event:?}") };
+    assert_eq!((changed.state(), changed.failure.unwrap().kind()), (TaskState::Ready, FailureKind::Bug));
+    say(&worker, &lease, field(&bench, 2).await).await;
+    assert!(cancelled(&mut worker).await.reason.contains("not held"), "a stale field changes nothing");
+
+    let lease = worker.lease().await;
+    assert!(track_job(&lease).frames.iter().all(|frame| frame.tracks.is_none()));
+    let mut fields = vec![field(&bench, 2).await];
+    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields: fields.clone() })).await;
+    assert!(!receipt.accepted && receipt.reason.contains("lacks the tracks to frame 3"), "{receipt:?}");
+
+    let lease = worker.lease().await;
+    assert_eq!(track_job(&lease).frames[1].tracks, fields[0].tracks, "what was verified counts");
+    fields[0].tracks = Some(bench.put(encoded(8, 7.0)).await);
+    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields })).await;
+    assert!(!receipt.accepted && receipt.reason.contains("was reported before"), "{receipt:?}");
+    let (state, failure) = bench.ended(&job).await;
+    let failure = failure.unwrap();
+    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::Bug), "its third attempt");
+    assert!(failure.message.contains("cam00"), "{}", failure.message);
+}
+
+#[tokio::test]
+async fn a_view_that_cannot_be_tracked_fails_the_job_which_may_be_submitted_again() {
+    let bench = Bench::start().await;
+    let [mut worker] = workers(&bench).await;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    let lease = worker.lease().await;
+    let success = trackersplat_proto::v1::Success::default();
+    let receipt = worker.report(&lease, Outcome::Success(success)).await;
+    assert!(receipt.accepted, "a report of another kind is a failure that the coordinator has taken");
+    let lease = worker.lease().await;
+    assert_eq!((track_job(&lease).view.as_str(), lease.attempt), ("cam00", 2));
+    assert!(worker.fail(&lease, FailureKind::BadInput).await.accepted);
+    let (state, failure) = bench.ended(&job).await;
+    let failure = failure.unwrap();
+    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::BadInput));
+    assert!(failure.message.contains("tracks of view 'cam00': bad input in a test"), "{}", failure.message);
+
+    assert!(bench.submit(tracked_request(&bench)).await.unwrap().resumed);
+    assert_eq!(bench.ended_tracking(&job, &mut worker).await, ["cam00", "cam01", "cam02"]);
+}
+
+#[tokio::test]
+async fn without_a_worker_the_coordinator_tracks_by_itself_and_another_job_reuses_it() {
+    let bench = Bench::start().await;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    let is_over = |event: &Event| matches!(event, Event::JobState(j) if j.state() == JobState::Frames);
+    let mut watch = bench.watch(&job, 0).await;
+    let mut done = Vec::new();
+    watch
+        .until(|event| {
+            if let Event::TracksState(t) = event
+                && t.state() == TaskState::Done
+            {
+                assert_eq!((t.worker_id.as_str(), t.attempt), ("(coordinator)", 1));
+                done.push(t.view.clone());
+            }
+            is_over(event)
+        })
+        .await;
+    done.sort();
+    assert_eq!(done, ["cam00", "cam01", "cam02"]);
+    let mut worker = bench.worker("w").await;
+    for frame in 1..=3 {
+        assert_eq!(worker.work_once(&bench).await, frame, "frames are for workers");
+    }
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
+}
+
+impl Bench {
+    /// Does every task of a job as one worker until the job is done; the views that were tracked, in order.
+    async fn ended_tracking(&self, job: &str, worker: &mut Worker) -> Vec<String> {
+        let mut views = Vec::new();
+        for _ in 0..6 {
+            let lease = worker.lease().await;
+            let Some(trackersplat_proto::v1::lease::Task::Tracks(request)) = lease.task.clone() else {
+                let success = self.result(&lease).await;
+                assert!(worker.report(&lease, Outcome::Success(success)).await.accepted);
+                continue;
+            };
+            views.push(request.view);
+            let mut fields = Vec::new();
+            for frame in request.frames.iter().skip(1).filter(|frame| frame.tracks.is_none()) {
+                fields.push(field(self, frame.frame).await);
+            }
+            let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields })).await;
+            assert!(receipt.accepted, "{receipt:?}");
+        }
+        assert_eq!(self.ended(job).await.0, JobState::Done);
+        views
+    }
+}

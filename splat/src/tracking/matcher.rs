@@ -1,0 +1,58 @@
+//! The socket of pair matchers: what finds the flow between two frames that the tracks are chained from.
+
+use std::convert::Infallible;
+
+use super::{
+    TrackingSettings,
+    consistency::Judged,
+    flow::Flow,
+    pair::{Frame, Guides, match_frames},
+    refine::{Smoothing, refine},
+};
+
+/// The flow from a frame to another, and back, at the finest level of the frames.
+pub(super) struct Ways {
+    pub(super) forward: Flow,
+    pub(super) backward: Flow,
+}
+
+/// Finds the flow between two frames of the same size.
+pub(super) trait PairMatcher: Sync {
+    /// Why it may fail.
+    type Error;
+
+    /// The flow both ways; `guides` is what is known beforehand.
+    fn both_ways(
+        &self,
+        first: &Frame,
+        second: &Frame,
+        guides: Option<Guides<'_>>,
+        settings: &TrackingSettings,
+    ) -> Result<Ways, Self::Error>;
+
+    /// The flow of chosen tracks from the key frame, drawn to where the key frame itself says they are.
+    fn anchored(&self, key: &Frame, frame: &Frame, tracks: &Judged, settings: &TrackingSettings) -> Flow;
+}
+
+/// The matcher without weights: patch search and variational refinement.
+pub(super) struct PatchSearch;
+
+impl PairMatcher for PatchSearch {
+    type Error = Infallible;
+
+    fn both_ways(
+        &self,
+        first: &Frame,
+        second: &Frame,
+        guides: Option<Guides<'_>>,
+        settings: &TrackingSettings,
+    ) -> Result<Ways, Infallible> {
+        let (forward, backward) = match_frames(first, second, guides, settings);
+        Ok(Ways { forward, backward })
+    }
+
+    fn anchored(&self, key: &Frame, frame: &Frame, tracks: &Judged, settings: &TrackingSettings) -> Flow {
+        let smoothing = Smoothing::of(settings);
+        refine(&key.reference(0), &frame.reference(0), &tracks.flow, Some(&tracks.visible), smoothing)
+    }
+}

@@ -1,0 +1,183 @@
+//! The tracks of a view from the wire to a report: every field is stored and said as soon as it is there.
+
+use std::sync::Arc;
+
+use backon::Retryable;
+use bytes::Bytes;
+use splat::{
+    formats::track_blob,
+    frame::FrameProgress,
+    image::Image,
+    tracking::{
+        TrackField, Tracker, TrackingSettings,
+        learned::{LearnedError, MAX_MODEL_BYTES},
+    },
+};
+use tokio::{
+    runtime::Handle,
+    sync::{mpsc::UnboundedSender, watch},
+};
+use tokio_util::sync::CancellationToken;
+use trackersplat_proto::v1::{Failure, FailureKind, TrackFrame, TrackJob, Tracked, TrackedField};
+
+use crate::{
+    blobs::{BlobError, Blobs},
+    connection::backoff,
+    job::{JobError, JobRunner, Outcome, not_ended},
+};
+
+/// Where a task says how far it is.
+#[derive(Clone, Debug)]
+pub(crate) struct Said {
+    pub(crate) progress: watch::Sender<FrameProgress>,
+    /// Fields that are stored; at most one per frame of the job.
+    pub(crate) fields: UnboundedSender<TrackedField>,
+}
+
+/// Why tracking ended early.
+enum Stop {
+    Cancelled,
+    Failed(JobError),
+}
+
+impl From<JobError> for Stop {
+    fn from(error: JobError) -> Self {
+        Self::Failed(error)
+    }
+}
+
+impl From<LearnedError> for Stop {
+    fn from(error: LearnedError) -> Self {
+        JobError::bad_input(error.to_string()).into()
+    }
+}
+
+impl JobRunner {
+    /// Tracks one view to its report; `None` if it was cancelled.
+    pub(crate) async fn track(
+        &self,
+        job: TrackJob,
+        blobs: Blobs,
+        said: Said,
+        cancel: CancellationToken,
+    ) -> Option<Outcome> {
+        let settings_json = job.tracker.as_ref().map_or("", |tracker| tracker.settings_json.as_str());
+        let settings: TrackingSettings = match serde_json::from_str(settings_json) {
+            Ok(settings) => settings,
+            Err(error) => {
+                return failed(JobError::bad_input(format!("the tracker's settings: {error}")));
+            }
+        };
+        let tracking = Tracking {
+            settings,
+            job,
+            blobs,
+            backoff: backoff(self.patience, self.jitter_seed),
+            said,
+            cancel,
+            runtime: Handle::current(),
+        };
+        let pool = self.pool.clone();
+        // On a blocking thread inside the worker's pool, so that heartbeats go on.
+        let ended = tokio::task::spawn_blocking(move || pool.install(|| tracking.run())).await;
+        match ended {
+            Ok(Ok(tracked)) => Some(Outcome::Tracked(tracked)),
+            Ok(Err(Stop::Cancelled)) => None,
+            Ok(Err(Stop::Failed(error))) => failed(error),
+            Err(error) => failed(not_ended("tracking", error)),
+        }
+    }
+}
+
+fn failed(error: JobError) -> Option<Outcome> {
+    Some(Outcome::Failure(Failure { kind: error.kind.into(), message: error.message }))
+}
+
+/// One view that is tracked. Runs on threads of the worker's pool, where waiting is allowed.
+struct Tracking {
+    settings: TrackingSettings,
+    job: TrackJob,
+    blobs: Blobs,
+    backoff: backon::ExponentialBuilder,
+    said: Said,
+    cancel: CancellationToken,
+    runtime: Handle,
+}
+
+impl Tracking {
+    fn run(&self) -> Result<Tracked, Stop> {
+        let frames = &self.job.frames;
+        // Tracks are chained through earlier frames: fields that exist before this one are made again, later ones not.
+        let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
+        let mut tracked = Tracked::default();
+        let mut load = |index: usize| self.load(&frames[index]);
+        let mut emit = |index: usize, field: TrackField| {
+            if frames[index].tracks.is_none() {
+                let stored = TrackedField {
+                    frame: frames[index].frame,
+                    tracks: Some(self.transfer(|| self.store(&field))?),
+                };
+                tracked.fields.push(stored.clone());
+                // Nobody listens any more: the lease is gone, and the report with it.
+                let _ = self.said.fields.send(stored);
+            }
+            self.advance(index, last)
+        };
+        self.advance(0, last)?;
+        self.tracker()?.track_view(last + 1, &mut load, &self.settings, &mut emit)?;
+        Ok(tracked)
+    }
+
+    fn tracker(&self) -> Result<Tracker, Stop> {
+        let wanted = self.job.tracker.clone().unwrap_or_default();
+        let bytes = match &wanted.model {
+            Some(blob) if blob.size > MAX_MODEL_BYTES as u64 => {
+                let (name, size) = (&wanted.model_name, blob.size);
+                let reason = format!("tracker {name}: {size} bytes, at most {MAX_MODEL_BYTES} are taken");
+                return Err(JobError::bad_input(reason).into());
+            }
+            Some(blob) => Some(self.transfer(|| self.blobs.get(blob))?.to_vec()),
+            None => None,
+        };
+        let model = bytes.map(|bytes| (bytes, wanted.model_name.as_str()));
+        Ok(Tracker::new(model, &self.settings)?)
+    }
+
+    fn advance(&self, index: usize, last: usize) -> Result<(), Stop> {
+        let progress = FrameProgress { stage: "tracks", done: index as u64, total: last as u64 };
+        self.said.progress.send_replace(progress);
+        if self.cancel.is_cancelled() { Err(Stop::Cancelled) } else { Ok(()) }
+    }
+
+    fn load(&self, frame: &TrackFrame) -> Result<Arc<Image>, Stop> {
+        let (view, number) = (&self.job.view, frame.frame);
+        let blob = frame.image.as_ref().ok_or_else(|| {
+            JobError::bad_input(format!(
+                "view '{view}' has no image at frame {number}: a defect of the coordinator"
+            ))
+        })?;
+        let bytes = self.transfer(|| self.blobs.get(blob))?;
+        let image = Image::decode(&bytes).map_err(|error| {
+            JobError::bad_input(format!("image of view '{view}' at frame {number}: {error}"))
+        })?;
+        Ok(Arc::new(image))
+    }
+
+    async fn store(&self, field: &TrackField) -> Result<trackersplat_proto::v1::Blob, BlobError> {
+        self.blobs.put(Bytes::from(track_blob::encode(field))).await
+    }
+
+    /// Waits for a transfer, which is tried again while it fails for reasons that may pass.
+    fn transfer<T, F: Future<Output = Result<T, BlobError>>>(
+        &self,
+        transfer: impl FnMut() -> F,
+    ) -> Result<T, Stop> {
+        let retried = transfer
+            .retry(self.backoff)
+            .when(|error| error.kind() == FailureKind::Transient)
+            .notify(|error, delay| tracing::debug!(%error, ?delay, "a transfer failed and is tried again"));
+        let retried = self.cancel.run_until_cancelled(async { retried.await });
+        let ended = self.runtime.block_on(retried).ok_or(Stop::Cancelled)?;
+        ended.map_err(|error| JobError::from(error).into())
+    }
+}
