@@ -157,3 +157,7 @@ impl Tracking {
         ended.map_err(|error| JobError::from(error).into())
     }
 }
+
+#[cfg(test)]
+#[path = "track_tests.rs"]
+mod tests;
