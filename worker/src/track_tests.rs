@@ -53,7 +53,7 @@ fn track_job(coordinator: &TestCoordinator, frames: u32) -> TrackJob {
     TrackJob {
         job_id: "job".into(),
         view: "cam00".into(),
-        tracker: Some(Tracker { settings_json }),
+        tracker: Some(Tracker { settings_json, ..Default::default() }),
         frames: (1..=frames).map(frame).collect(),
     }
 }
@@ -135,7 +135,7 @@ async fn bad_images_and_settings_name_the_view_and_are_bad_input() {
     let mut nameless = track_job(&coordinator, 2);
     nameless.frames[1].image = None;
     let mut unset = track_job(&coordinator, 2);
-    unset.tracker = Some(Tracker { settings_json: r#"{"gap": 3}"#.into() });
+    unset.tracker = Some(Tracker { settings_json: r#"{"gap": 3}"#.into(), ..Default::default() });
     let (_worker, _shutdown) = start(&coordinator, 1);
     let mut session = coordinator.welcome().await;
     for (job, said) in [(damaged, "'cam00' at frame 3"), (nameless, "no image at frame 2"), (unset, "gap")] {
