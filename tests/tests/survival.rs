@@ -38,14 +38,43 @@ const SETTINGS: [&str; 15] = [
     "motion.field_rounds=1",
 ];
 
+/// The views are tracked, and little else happens.
+const TRACKED: [&str; 11] = [
+    "-v",
+    "--device",
+    "cpu",
+    "--set",
+    "static_model.max_steps=30",
+    "--set",
+    "static_model.densify_until=0.0",
+    "--set",
+    "refine.iterations=10",
+    "--set",
+    "motion.field_rounds=1",
+];
+
 fn clip() -> &'static Path {
     static CLIP: OnceLock<TempDir> = OnceLock::new();
     CLIP.get_or_init(|| clips::scratch(4, 4)).path()
 }
 
+fn small_clip() -> &'static Path {
+    static CLIP: OnceLock<TempDir> = OnceLock::new();
+    CLIP.get_or_init(|| clips::halved(4, 4)).path()
+}
+
+fn command(clip: &Path, output: &Path, workers: usize, settings: &[&str]) -> Vec<String> {
+    let fixed = ["reconstruct", clip.to_str().unwrap(), "--out", output.to_str().unwrap(), "--workers"];
+    fixed.iter().chain([&workers.to_string().as_str()]).chain(settings).map(|&a| a.to_owned()).collect()
+}
+
 fn arguments(output: &Path, workers: usize) -> Vec<String> {
-    let fixed = ["reconstruct", clip().to_str().unwrap(), "--out", output.to_str().unwrap(), "--workers"];
-    fixed.iter().chain([&workers.to_string().as_str()]).chain(&SETTINGS).map(|&a| a.to_owned()).collect()
+    command(clip(), output, workers, &SETTINGS)
+}
+
+/// A run that tracks by itself.
+fn tracking(output: &Path, workers: usize) -> Vec<String> {
+    command(small_clip(), output, workers, &TRACKED)
 }
 
 fn results(output: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
@@ -61,24 +90,38 @@ fn results(output: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     files
 }
 
+type Files = BTreeMap<PathBuf, Vec<u8>>;
+
+fn files_of(arguments: impl Fn(&Path, usize) -> Vec<String>) -> Files {
+    let output = tempfile::tempdir().unwrap();
+    let (code, log) = program::run(arguments(output.path(), 2));
+    assert_eq!(code, 0, "{log}");
+    results(output.path())
+}
+
 /// The files of an undisturbed run with two workers.
-fn undisturbed() -> &'static BTreeMap<PathBuf, Vec<u8>> {
-    static FILES: OnceLock<BTreeMap<PathBuf, Vec<u8>>> = OnceLock::new();
-    FILES.get_or_init(|| {
-        let output = tempfile::tempdir().unwrap();
-        let (code, log) = program::run(arguments(output.path(), 2));
-        assert_eq!(code, 0, "{log}");
-        results(output.path())
-    })
+fn undisturbed() -> &'static Files {
+    static FILES: OnceLock<Files> = OnceLock::new();
+    FILES.get_or_init(|| files_of(arguments))
+}
+
+/// The same of a run that tracks by itself.
+fn undisturbed_tracking() -> &'static Files {
+    static FILES: OnceLock<Files> = OnceLock::new();
+    FILES.get_or_init(|| files_of(tracking))
+}
+
+fn assert_same(output: &Path, expected: &Files) {
+    let files = results(output);
+    let (found, names): (Vec<_>, Vec<_>) = (files.keys().collect(), expected.keys().collect());
+    assert_eq!(found, names, "the same files");
+    for (name, bytes) in &files {
+        assert!(bytes == &expected[name], "{} has the same bytes", name.display());
+    }
 }
 
 fn assert_undisturbed(output: &Path) {
-    let files = results(output);
-    let (found, expected): (Vec<_>, Vec<_>) = (files.keys().collect(), undisturbed().keys().collect());
-    assert_eq!(found, expected, "the same files");
-    for (name, bytes) in &files {
-        assert!(bytes == &undisturbed()[name], "{} has the same bytes", name.display());
-    }
+    assert_same(output, undisturbed());
 }
 
 fn signal(process: i32, signal: Signal) {
@@ -194,4 +237,52 @@ fn an_interrupted_run_is_resumed_by_the_same_command() {
     assert_eq!(code, 0, "{log}");
     assert!(log.contains("resumed=true"), "{log}");
     assert_undisturbed(output.path());
+}
+
+#[test]
+fn one_worker_and_the_coordinator_alone_track_the_same_bytes_as_two_workers() {
+    let output = tempfile::tempdir().unwrap();
+    let (code, log) = program::run(tracking(output.path(), 1));
+    assert_eq!(code, 0, "{log}");
+    assert_same(output.path(), undisturbed_tracking());
+
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(tracking(output.path(), 0));
+    let line = run.wait_for(&["started; coordinator at http://"]);
+    let address = line.split_once("coordinator at ").unwrap().1.split_once(',').unwrap().0.to_owned();
+    run.wait_for(&["job", "state=\"frames\""]);
+    run.wait_for(&["tracks", "state=\"done\"", "worker=\"(coordinator)\""]);
+    let fixed = ["worker", "--coordinator", &address, "--device", "cpu", "--threads", "1"];
+    let _worker = program::start(fixed);
+    let status = run.wait();
+    assert!(status.success(), "{}", run.log());
+    assert_same(output.path(), undisturbed_tracking());
+}
+
+#[test]
+fn a_worker_killed_while_it_tracks_a_view_changes_nothing() {
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(tracking(output.path(), 2));
+    run.wait_for(&["progress", "stage=\"tracking\"", "done=1"]);
+    signal(run.children()[0], Signal::SIGKILL);
+    let status = run.wait();
+    assert!(status.success(), "{}", run.log());
+    assert_same(output.path(), undisturbed_tracking());
+    let is_again = |line: &str| line.contains("tracks") && line.contains("attempt=2");
+    assert!(run.log().lines().any(is_again), "a lost view was leased again:\n{}", run.log());
+}
+
+#[test]
+fn a_coordinator_killed_while_views_are_tracked_keeps_the_fields_that_exist() {
+    let output = tempfile::tempdir().unwrap();
+    let mut run = program::start(tracking(output.path(), 2));
+    run.wait_for(&["progress", "stage=\"tracking\"", "done=3"]);
+    run.kill();
+    let mut again = program::start(tracking(output.path(), 2));
+    assert!(again.wait().success(), "{}", again.log());
+    let log = again.log();
+    assert!(log.contains("resumed=true"), "{log}");
+    let from_nothing = |line: &str| line.contains("stage=\"tracking\"") && line.contains("done=0 ");
+    assert!(!log.lines().any(from_nothing), "three fields existed:\n{log}");
+    assert_same(output.path(), undisturbed_tracking());
 }

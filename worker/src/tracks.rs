@@ -181,3 +181,7 @@ impl Tracking {
         ended.map_err(|error| JobError::from(error).into())
     }
 }
+
+#[cfg(test)]
+#[path = "track_tests.rs"]
+mod tests;

@@ -18,13 +18,12 @@ use super::Job;
 use crate::{compute::go_on, failure::StageError, hub::Hub, queue::Lease};
 
 impl Job {
-    /// Tracks views whenever no connected worker may, until every view is tracked.
+    /// Tracks views whenever no connected worker may, until nobody has a view to track any more.
     pub(super) async fn track_alone(&self) -> Result<(), StageError> {
         let mut changed = self.changed.clone();
         loop {
             changed.borrow_and_update();
-            let (done, total) = self.hub.tracks(&self.id, |ledger| ledger.counts()).await?;
-            if done == total {
+            if self.hub.open_tracks(&self.id).await? == 0 {
                 return Ok(());
             }
             if self.hub.has_own_work(&self.id).await {

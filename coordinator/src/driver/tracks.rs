@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use splat::settings::MotionSource;
 use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
-use super::Job;
+use super::{Job, frames::FrameWork};
 use crate::{
     failure::StageError,
     keys::{TrackKey, VERSION, digest_of},
@@ -44,7 +44,7 @@ impl Job {
     }
 
     /// Publishes every frame, in order, once all views are tracked to it.
-    async fn publish_tracked(&self, work: &super::frames::FrameWork) -> Result<(), StageError> {
+    async fn publish_tracked(&self, work: &FrameWork) -> Result<(), StageError> {
         let mut changed = self.changed.clone();
         for &frame in &self.frames {
             let tracks = loop {

@@ -114,6 +114,12 @@ impl Hub {
         }
     }
 
+    /// Number of views of a job that are ready to be tracked or leased; fails if one cannot be tracked.
+    pub(crate) async fn open_tracks(&self, job: &JobId) -> Result<usize, StageError> {
+        self.tracks(job, |_| ()).await?;
+        Ok(self.desk.lock().await.queue.open_tracks(job))
+    }
+
     /// Whether a view of the job is to be tracked by the coordinator itself: no connected worker may.
     pub(crate) async fn has_own_work(&self, job: &JobId) -> bool {
         self.desk.lock().await.queue.has_own_work(job)

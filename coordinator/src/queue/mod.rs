@@ -1,7 +1,8 @@
 //! Which task goes to which worker: pure and synchronous, time is a parameter.
 //!
-//! A task is a frame, or the tracks of one view. The queue knows the open ones only (ready or leased). Its caller writes every change to the database before any
-//! worker or client hears of it, and rebuilds the queue from there after a restart.
+//! A task is a frame, or the tracks of one view. The queue knows the open ones only (ready or leased). Its caller
+//! writes every change to the database before any worker or client hears of it, and rebuilds the queue from there after
+//! a restart.
 
 pub mod job;
 mod lease;
@@ -368,6 +369,12 @@ impl Queue {
     /// Open tasks of a job.
     pub fn open_tasks(&self, job: &str) -> usize {
         self.tasks.keys().filter(|key| &*key.job == job).count()
+    }
+
+    /// Open tracks of a job.
+    pub fn open_tracks(&self, job: &str) -> usize {
+        let is_open = |key: &&TaskKey| &*key.job == job && matches!(key.task, Task::Tracks(_));
+        self.tasks.keys().filter(is_open).count()
     }
 
     /// Connected workers.

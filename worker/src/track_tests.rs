@@ -1,0 +1,182 @@
+//! What a coordinator sees of a worker that tracks a view.
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use std::time::Duration;
+
+use splat::{frame::FrameError, image::Image, raster::CpuEngine, tracking::TrackingSettings};
+use tokio::task::JoinHandle;
+use trackersplat_proto::v1::{
+    Blob, CancelLease, FieldReport, Lease, Report, TrackFrame, TrackJob, Tracker, coordinator_message, lease,
+    report, worker_message,
+};
+
+use super::*;
+use crate::{
+    Exit, WorkerError, WorkerOptions,
+    job::Reconstruct,
+    run::run_with,
+    test_coordinator::{Session, TestCoordinator},
+};
+
+fn start(
+    coordinator: &TestCoordinator,
+    threads: usize,
+) -> (JoinHandle<Result<Exit, WorkerError>>, CancellationToken) {
+    let options = WorkerOptions {
+        coordinator: coordinator.address.clone(),
+        threads,
+        worker_id: Some("worker-a".into()),
+        state_dir: None,
+        reconnect_for: Duration::from_secs(15),
+        remote_blobs: false,
+    };
+    let no_frames: Reconstruct = Arc::new(|_, _| Err(FrameError::BadInput("no frame in this test".into())));
+    let shutdown = CancellationToken::new();
+    let engine = Arc::new(CpuEngine::default());
+    (tokio::spawn(run_with(options, engine, no_frames, shutdown.clone())), shutdown)
+}
+
+/// A textured image whose texture moves by one pixel per frame.
+fn image(frame: u32) -> Vec<u8> {
+    let mut image = Image::filled(24, 16, [0.0; 3]);
+    for (index, pixel) in image.pixels.chunks_exact_mut(3).enumerate() {
+        let (x, y) = ((index % 24) as f32 - frame as f32, (index / 24) as f32);
+        pixel.fill(0.5 + 0.25 * (x * 0.9).sin() + 0.25 * (y * 0.7 + x * 0.2).cos());
+    }
+    image.encode_png()
+}
+
+/// One view over some frames, frame 1 first.
+fn track_job(coordinator: &TestCoordinator, frames: u32) -> TrackJob {
+    let frame = |frame| TrackFrame { frame, image: Some(coordinator.store(&image(frame))), tracks: None };
+    let settings_json = serde_json::to_string(&TrackingSettings::default()).unwrap();
+    TrackJob {
+        job_id: "job".into(),
+        view: "cam00".into(),
+        tracker: Some(Tracker { settings_json }),
+        frames: (1..=frames).map(frame).collect(),
+    }
+}
+
+async fn lease(session: &Session, lease_id: &str, job: TrackJob) {
+    let task = Some(lease::Task::Tracks(job));
+    let lease = Lease { lease_id: lease_id.into(), attempt: 1, task, likely_next: None };
+    session.send(coordinator_message::Message::Lease(lease)).await;
+}
+
+async fn next_field(session: &mut Session) -> FieldReport {
+    session
+        .wait_for(
+            |message| if let worker_message::Message::Field(field) = message { Some(field) } else { None },
+        )
+        .await
+}
+
+fn fields_of(report: Report) -> Vec<(u32, Blob)> {
+    let Some(report::Outcome::Tracked(tracked)) = report.outcome else { panic!("{report:?}") };
+    tracked.fields.into_iter().map(|field| (field.frame, field.tracks.unwrap())).collect()
+}
+
+/// The report of a fresh worker with some threads.
+async fn tracked_with(coordinator: &TestCoordinator, threads: usize, job: TrackJob) -> Vec<(u32, Blob)> {
+    let (_worker, shutdown) = start(coordinator, threads);
+    let mut session = coordinator.welcome().await;
+    lease(&session, "lease-1", job).await;
+    let report = session.wait_for_report().await;
+    session.acknowledge(&report).await;
+    session.wait_for_lease_request().await;
+    shutdown.cancel();
+    fields_of(report)
+}
+
+#[tokio::test]
+async fn every_field_is_stored_and_said_before_the_report_that_names_them_all() {
+    let coordinator = TestCoordinator::start().await;
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    session.wait_for_lease_request().await;
+    lease(&session, "lease-1", track_job(&coordinator, 4)).await;
+    let first = next_field(&mut session).await;
+    assert_eq!((first.lease_id.as_str(), first.attempt), ("lease-1", 1));
+    let first = first.field.unwrap();
+    assert_eq!(first.frame, 2, "in order of frames");
+    let stored = coordinator.stored(&first.tracks.clone().unwrap().digest);
+    let field = track_blob::decode(&stored).unwrap();
+    assert_eq!((field.width, field.height), (24, 16));
+    let fields = fields_of(session.wait_for_report().await);
+    assert_eq!(fields.iter().map(|field| field.0).collect::<Vec<_>>(), [2, 3, 4]);
+    assert_eq!(Some(&fields[0].1), first.tracks.as_ref());
+}
+
+#[tokio::test]
+async fn any_number_of_threads_and_any_resumption_give_the_same_fields() {
+    let coordinator = TestCoordinator::start().await;
+    let job = track_job(&coordinator, 5);
+    let whole = tracked_with(&coordinator, 1, job.clone()).await;
+    assert_eq!(tracked_with(&coordinator, 3, job.clone()).await, whole);
+
+    let mut resumed = job.clone();
+    for (frame, blob) in [&whole[0], &whole[1], &whole[3]] {
+        resumed.frames[*frame as usize - 1].tracks = Some(blob.clone());
+    }
+    assert_eq!(tracked_with(&coordinator, 1, resumed).await, [whole[2].clone()], "only what is missing");
+    let mut complete = job;
+    for (frame, blob) in &whole {
+        complete.frames[*frame as usize - 1].tracks = Some(blob.clone());
+    }
+    assert_eq!(tracked_with(&coordinator, 1, complete).await, []);
+}
+
+#[tokio::test]
+async fn bad_images_and_settings_name_the_view_and_are_bad_input() {
+    let coordinator = TestCoordinator::start().await;
+    let mut damaged = track_job(&coordinator, 3);
+    damaged.frames[2].image = Some(coordinator.store(b"\x89PNG cut short"));
+    let mut nameless = track_job(&coordinator, 2);
+    nameless.frames[1].image = None;
+    let mut unset = track_job(&coordinator, 2);
+    unset.tracker = Some(Tracker { settings_json: r#"{"gap": 3}"#.into() });
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    for (job, said) in [(damaged, "'cam00' at frame 3"), (nameless, "no image at frame 2"), (unset, "gap")] {
+        lease(&session, said, job).await;
+        let report = session.wait_for_report().await;
+        session.acknowledge(&report).await;
+        session.wait_for_lease_request().await;
+        let Some(report::Outcome::Failure(failure)) = report.outcome else { panic!("{report:?}") };
+        assert_eq!(failure.kind(), FailureKind::BadInput);
+        assert!(failure.message.contains(said), "{}", failure.message);
+    }
+}
+
+#[tokio::test]
+async fn a_cancelled_view_is_dropped_without_a_report() {
+    let coordinator = TestCoordinator::start().await;
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    session.wait_for_lease_request().await;
+    lease(&session, "lease-1", track_job(&coordinator, 200)).await;
+    next_field(&mut session).await;
+    let cancel = CancelLease { lease_id: "lease-1".into(), reason: "the job was cancelled".into() };
+    session.send(coordinator_message::Message::CancelLease(cancel)).await;
+    let asked = session.wait_for(|message| match message {
+        worker_message::Message::LeaseRequest(_) => Some(true),
+        worker_message::Message::Report(_) => Some(false),
+        _ => None,
+    });
+    assert!(asked.await, "it asks for something else");
+}
+
+#[tokio::test]
+async fn tracking_goes_on_over_a_broken_stream_and_the_report_names_what_was_not_heard() {
+    let coordinator = TestCoordinator::start().await;
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    lease(&session, "lease-1", track_job(&coordinator, 12)).await;
+    next_field(&mut session).await;
+    drop(session);
+    let mut session = coordinator.welcome().await;
+    assert_eq!(session.register.held_lease_id, "lease-1");
+    let fields = fields_of(session.wait_for_report().await);
+    assert_eq!(fields.iter().map(|field| field.0).collect::<Vec<_>>(), (2..=12).collect::<Vec<_>>());
+}
