@@ -53,7 +53,7 @@ fn track_job(coordinator: &TestCoordinator, frames: u32) -> TrackJob {
     TrackJob {
         job_id: "job".into(),
         view: "cam00".into(),
-        tracker: Some(Tracker { settings_json, ..Default::default() }),
+        tracker: Some(Tracker { settings_json, ..Tracker::default() }),
         frames: (1..=frames).map(frame).collect(),
     }
 }
@@ -135,10 +135,22 @@ async fn bad_images_and_settings_name_the_view_and_are_bad_input() {
     let mut nameless = track_job(&coordinator, 2);
     nameless.frames[1].image = None;
     let mut unset = track_job(&coordinator, 2);
-    unset.tracker = Some(Tracker { settings_json: r#"{"gap": 3}"#.into(), ..Default::default() });
+    unset.tracker = Some(Tracker { settings_json: r#"{"gap": 3}"#.into(), ..Tracker::default() });
+    let mut no_network = track_job(&coordinator, 2);
+    give(&coordinator, &mut no_network, b"no network");
+    let mut too_large = no_network.clone();
+    if let Some(model) = too_large.tracker.as_mut().and_then(|tracker| tracker.model.as_mut()) {
+        model.size = u64::MAX;
+    }
     let (_worker, _shutdown) = start(&coordinator, 1);
     let mut session = coordinator.welcome().await;
-    for (job, said) in [(damaged, "'cam00' at frame 3"), (nameless, "no image at frame 2"), (unset, "gap")] {
+    for (job, said) in [
+        (damaged, "'cam00' at frame 3"),
+        (nameless, "no image at frame 2"),
+        (unset, "gap"),
+        (no_network, "net.onnx: cannot load"),
+        (too_large, "net.onnx: 18446744073709551615 bytes"),
+    ] {
         lease(&session, said, job).await;
         let report = session.wait_for_report().await;
         session.acknowledge(&report).await;
@@ -146,6 +158,56 @@ async fn bad_images_and_settings_name_the_view_and_are_bad_input() {
         let Some(report::Outcome::Failure(failure)) = report.outcome else { panic!("{report:?}") };
         assert_eq!(failure.kind(), FailureKind::BadInput);
         assert!(failure.message.contains(said), "{}", failure.message);
+    }
+}
+
+/// A length-delimited field of an ONNX message; numbers of fields below 16, lengths below 16384.
+fn part(number: u8, content: &[u8]) -> Vec<u8> {
+    let length = content.len();
+    [&[number << 3 | 2, (length & 0x7f) as u8 | 0x80, (length >> 7) as u8], content].concat()
+}
+
+/// A network for images of 24 × 16 that sees everything, moved alike.
+fn network(motion: [f32; 2]) -> Vec<u8> {
+    let (columns, rows) = (24, 16);
+    let output = |name: &str, channels: &[f32]| {
+        let constant = format!("constant of {name}");
+        let values: Vec<u8> = channels
+            .iter()
+            .flat_map(|value| value.to_le_bytes().repeat(usize::from(columns) * usize::from(rows)))
+            .collect();
+        let shape = [8, 1, 8, channels.len() as u8, 8, rows, 8, columns];
+        let float = [16, 1];
+        let tensor = [&shape[..], &float, &part(8, constant.as_bytes()), &part(9, &values)].concat();
+        let identity =
+            [part(1, constant.as_bytes()), part(2, name.as_bytes()), part(4, b"Identity")].concat();
+        [part(5, &tensor), part(1, &identity), part(12, &part(1, name.as_bytes()))].concat()
+    };
+    let inputs = [b"image1", b"image2"].map(|name| part(11, &part(1, name))).concat();
+    let graph = [inputs, output("flow", &motion), output("visibility", &[1.0])].concat();
+    [&[8, 8], &part(7, &graph)[..], &part(8, &[16, 17])].concat()
+}
+
+fn give(coordinator: &TestCoordinator, job: &mut TrackJob, network: &[u8]) {
+    if let Some(tracker) = &mut job.tracker {
+        tracker.model = Some(coordinator.store(network));
+        tracker.model_name = "net.onnx".into();
+    }
+}
+
+#[tokio::test]
+async fn a_network_that_comes_with_the_job_tracks() {
+    let coordinator = TestCoordinator::start().await;
+    let mut job = track_job(&coordinator, 3);
+    give(&coordinator, &mut job, &network([2.0, -0.25]));
+    let fields = tracked_with(&coordinator, 1, job).await;
+    assert_eq!(fields.len(), 2);
+    for (_, blob) in fields {
+        let field = track_blob::decode(&coordinator.stored(&blob.digest)).unwrap();
+        assert_eq!((field.width, field.height), (24, 16));
+        // Multiples of a 64th of a pixel are stored exactly.
+        assert_eq!(field.positions[5 * 24 + 7], [7.5 + 2.0, 5.5 - 0.25]);
+        assert!(field.visible[5 * 24 + 7]);
     }
 }
 

@@ -48,7 +48,7 @@ struct Node {
 
 #[derive(Clone, PartialEq, Message)]
 struct Tensor {
-    #[prost(int64, repeated, tag = "1")]
+    #[prost(int64, repeated, packed = "false", tag = "1")]
     shape: Vec<i64>,
     #[prost(int32, tag = "2")]
     kind: i32,
