@@ -32,6 +32,10 @@ use crate::{
 /// Steps that may be submitted before their losses are looked at.
 const REMEMBERED: usize = 256;
 
+/// Steps that may be at work or wait for it. Enough that the device never waits for the host; few, so that the steps that were asked
+/// for are about those that are done, for who counts them and for who stops.
+const IN_FLIGHT: usize = 16;
+
 /// Decay of the optimiser's moments, as in `splat::optim`.
 const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
@@ -329,6 +333,9 @@ impl Session for GpuSession {
         self.guarded(|session| {
             if session.submitted.len() == REMEMBERED {
                 session.settle()?;
+            }
+            if let Some(earlier) = session.submitted.iter().rev().nth(IN_FLIGHT - 1) {
+                session.context.device.wait(Some(earlier.submission.clone()))?;
             }
             session.steps += 1;
             let number = session.steps;

@@ -10,7 +10,11 @@ mod report;
 mod scene;
 mod tracks;
 
-use std::{fs, path::PathBuf, process::ExitCode};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::ExitCode,
+};
 
 use anyhow::{Context, Result};
 use clap::Parser;
@@ -73,27 +77,40 @@ fn run(arguments: &Arguments) -> Result<bool> {
     let adapter = Adapter::new(engine.device());
     println!("{adapter}\n");
     let checks = parity::run(&engine, other.as_ref())?;
-    let mut report =
-        Report { version: env!("CARGO_PKG_VERSION"), adapter, checks, rows: Vec::new(), refinement: None };
+    let mut report = Report {
+        version: env!("CARGO_PKG_VERSION"),
+        adapter,
+        is_complete: false,
+        checks,
+        rows: Vec::new(),
+        refinement: None,
+    };
+    save(&report, arguments.json.as_deref())?;
     println!();
     if !arguments.no_benchmark {
         for source in sources(arguments) {
             let row = Row::measure(&engine, source, arguments.quick)?;
             println!("{row}");
             report.rows.push(row);
+            // A large scene may be the end of a device; what was found before it is worth having.
+            save(&report, arguments.json.as_deref())?;
         }
         let refinement = benchmark::refinement(&engine, arguments.quick, arguments.max_gaussians)?;
         println!("\n{refinement}");
         report.checks.push(refinement.check());
         report.refinement = Some(refinement);
     }
-    if let Some(path) = &arguments.json {
-        let text = serde_json::to_string_pretty(&report)?;
-        fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))?;
-    }
+    report.is_complete = true;
+    save(&report, arguments.json.as_deref())?;
     let failed = report.checks.iter().filter(|check| !check.passed()).count();
     println!("\n{} checks, {failed} failed", report.checks.len());
     Ok(failed == 0)
+}
+
+fn save(report: &Report, path: Option<&Path>) -> Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    let text = serde_json::to_string_pretty(report)?;
+    fs::write(path, text + "\n").with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn open(device: &str) -> Result<GpuDevice> {

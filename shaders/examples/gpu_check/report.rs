@@ -12,6 +12,8 @@ use crate::benchmark::{Refinement, Row};
 pub(crate) struct Report {
     pub version: &'static str,
     pub adapter: Adapter,
+    /// Whether the program came to its end; it writes what it has as it goes.
+    pub is_complete: bool,
     pub checks: Vec<Check>,
     pub rows: Vec<Row>,
     pub refinement: Option<Refinement>,

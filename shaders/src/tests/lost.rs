@@ -87,6 +87,17 @@ fn a_device_that_hangs_is_lost_after_its_time() {
 }
 
 #[test]
+fn steps_do_not_run_far_ahead_of_the_device() {
+    if engine().is_none() {
+        return;
+    }
+    let device = open().with_poll(|_, _| Err(PollError::Timeout));
+    let mut session = GpuEngine::new(device).unwrap().session(input()).unwrap();
+    let taken = (0..100).take_while(|_| session.step(0, &RATES).is_ok()).count();
+    assert_eq!(taken, 16, "the next one waits for the first");
+}
+
+#[test]
 fn a_broken_rule_fails_who_broke_it_and_nobody_else() {
     let Some(engine) = engine() else { return };
     let device = &engine.context.device;

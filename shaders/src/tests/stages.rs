@@ -93,6 +93,12 @@ impl Footprint {
         [a * e.x + b * e.y, c * e.x + d * e.y]
     }
 
+    /// Of the two terms of each, which may cancel.
+    fn whitened_sizes(&self, at: DVec2) -> [f64; 2] {
+        let ([a, b, c, d], e) = (self.whitening.map(f64::abs), (at - self.mean).abs());
+        [a * e.x + b * e.y, c * e.x + d * e.y]
+    }
+
     fn alpha(&self, at: DVec2) -> f64 {
         let [u, w] = self.whitened(at);
         (self.peak - u * u - w * w).exp2()
@@ -193,7 +199,7 @@ impl Drawn {
 }
 
 /// Software takes some hundredths of a second for each.
-const CASES: u32 = 24;
+const CASES: u32 = 48;
 
 fn check(strategy: impl Strategy<Value = Scene>, property: impl Fn(&GpuEngine, &Scene)) {
     let Some(engine) = support::engine() else { return };
@@ -325,10 +331,11 @@ fn sums_of(drawn: &Drawn, seeds: &[[f32; 4]], slots: usize) -> Vec<[(f64, f64); 
             behind += alpha * excess;
             size += alpha * largest;
             let follows = if alpha >= f64::from(ALPHA_MAX) { 0.0 } else { before * alpha };
-            let [u, w] = footprint.whitened(at);
-            for (k, by) in [1.0, u, w, u * u, u * w, w * w].into_iter().enumerate() {
+            let powers = |[u, w]: [f64; 2]| [1.0, u, w, u * u, u * w, w * w];
+            let sizes = powers(footprint.whitened_sizes(at));
+            for (k, by) in powers(footprint.whitened(at)).into_iter().enumerate() {
                 sums[slot][k].0 += follows * excess * by;
-                sums[slot][k].1 += follows * largest * by.abs();
+                sums[slot][k].1 += follows * largest * sizes[k];
             }
             for (k, by) in [red, green, blue].into_iter().enumerate() {
                 sums[slot][6 + k].0 += before * alpha * by;
@@ -384,7 +391,8 @@ fn project_backward() {
             let largest = theirs.iter().fold(1e-3_f32, |largest, value| largest.max(value.abs()));
             for (place, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
                 let off = (ours - theirs).abs();
-                assert!(off <= 1e-4 * largest, "{array} {place}: {ours}, on the CPU {theirs}, of {largest}");
+                // A place is held to 3e-5 px (`project`), and the steepest footprint falls by six of its weight per pixel.
+                assert!(off <= 2e-4 * largest, "{array} {place}: {ours}, on the CPU {theirs}, of {largest}");
             }
         }
     });
