@@ -235,3 +235,12 @@ fn shapes_that_boast_are_refused() {
     let message = read_track_npz(&path).unwrap_err().to_string();
     assert!(message.contains("needs more than"), "{message}");
 }
+
+#[test]
+fn validity_is_read_apart_and_must_fit_the_size() {
+    let (_folder, path) = flow().array("valid", &[2], &[0b0111_1110_u8, 0x80]).finish();
+    let valid = read_exact_validity(&path, 3, 3).unwrap();
+    assert_eq!(valid, [false, true, true, true, true, true, true, false, true]);
+    let error = read_exact_validity(&path, 5, 5).unwrap_err().to_string();
+    assert!(error.contains("[2]") && error.contains("[4]"), "{error}");
+}
