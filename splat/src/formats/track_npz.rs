@@ -25,10 +25,12 @@ use zip::ZipArchive;
 use super::TrackError;
 use crate::tracking::TrackField;
 
+mod points;
 #[cfg(test)]
 mod tests;
 mod writer;
 
+pub use points::PointTracks;
 pub use writer::TrackNpzWriter;
 
 /// Smallest standard deviation of imported tracks, pixels: below it interpolation and sampling err more than tracks.
