@@ -16,9 +16,11 @@ mod layers;
 mod logs;
 mod outcome;
 mod output_owner;
+mod pictures;
 mod scratch;
 mod stdout;
 mod table;
+mod tracking;
 mod worker_processes;
 
 use std::process::ExitCode;

@@ -5,12 +5,14 @@ mod coordinator;
 mod demo;
 mod devices;
 mod eval;
+mod eval_tracks;
 mod fetch;
 mod inspect;
 mod list;
 mod reconstruct;
 mod render;
 mod submit;
+mod track;
 mod watch;
 mod worker;
 
@@ -44,6 +46,12 @@ pub(crate) enum Command {
     Eval(eval::EvalArgs),
     /// Render a frame of a result from one of its views.
     Render(render::RenderArgs),
+    /// Track every pixel of the key frame through a clip, and write the tracks.
+    #[command(after_help = EXIT_CODES)]
+    Track(track::TrackArgs),
+    /// Measure tracks against the exact flow of a rendered clip.
+    #[command(after_help = EXIT_CODES)]
+    EvalTracks(eval_tracks::EvalTracksArgs),
     /// Say what is in a Gaussian file.
     Inspect(inspect::InspectArgs),
     /// List the devices that a worker can use.
@@ -77,6 +85,8 @@ pub(crate) fn run(cli: Cli) -> Result<(), CliError> {
     match command {
         Command::Eval(args) => eval::run(args),
         Command::Render(args) => render::run(args),
+        Command::Track(args) => track::run(args, &logs),
+        Command::EvalTracks(args) => eval_tracks::run(args, &logs),
         Command::Inspect(args) => inspect::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Reconstruct(args) => wait(reconstruct::run(args, &logs)),

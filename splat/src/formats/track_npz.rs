@@ -29,8 +29,13 @@ use crate::tracking::TrackField;
 
 mod conventions;
 mod grid;
+mod points;
 #[cfg(test)]
 mod tests;
+mod writer;
+
+pub use points::PointTracks;
+pub use writer::TrackNpzWriter;
 
 pub use conventions::read_tracks;
 
@@ -89,6 +94,18 @@ pub fn read_exact_flow(path: &Path) -> Result<Vec<TrackField>, TrackError> {
         sigma: vec![1.0 / FLOW_STEPS + SIGMA_FLOOR; pixels],
     };
     Ok(flow.values.chunks_exact(2 * pixels).enumerate().map(field).collect())
+}
+
+/// Reads which pixels of a view have exact flow, of `width × height` pixels.
+pub fn read_exact_validity(path: &Path, width: u32, height: u32) -> Result<Vec<bool>, TrackError> {
+    let pixels = width as usize * height as usize;
+    let mut archive = Archive::open(path)?;
+    let valid = archive.bytes(&["valid"])?;
+    if valid.shape != [pixels.div_ceil(8) as u64] {
+        let expected = format!("[{}] (packed bits of [{pixels}])", pixels.div_ceil(8));
+        return Err(archive.shape(&valid.name, &valid.shape, expected));
+    }
+    Ok((0..pixels).map(|index| numpy_bit(&valid.values, index)).collect())
 }
 
 /// Reads a tracker's field of one view; index `i` is the field of frame `i + 2`, counting the key frame as 1.

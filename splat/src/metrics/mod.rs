@@ -1,7 +1,8 @@
-//! Image quality: PSNR and SSIM, in double precision, of images clamped to `[0, 1]`.
+//! Image quality: PSNR and SSIM, in double precision, of images clamped to `[0, 1]`; and how good tracks are.
 
 #[cfg(test)]
 mod tests;
+pub mod tracks;
 
 use crate::{
     image::{Image, Mask},

@@ -13,6 +13,7 @@ pub(super) fn chain(to_earlier: &Judged, onward: &Judged) -> Judged {
     let mut flow = Flow::zeros(width, height);
     let mut visible = Vec::with_capacity(width * height);
     let mut sigma = Vec::with_capacity(width * height);
+    let mut links = Vec::with_capacity(width * height);
     for y in 0..height {
         for x in 0..width {
             let i = y * width + x;
@@ -25,13 +26,18 @@ pub(super) fn chain(to_earlier: &Judged, onward: &Judged) -> Judged {
             let step_seen = corners.iter().all(|&(corner, weight)| weight < 0.05 || onward.visible[corner]);
             let inside = is_inside(x as f32 + flow.u[i], y as f32 + flow.v[i], width, height);
             visible.push(to_earlier.visible[i] && step_seen && inside);
-            let step_sigma: f32 = corners.iter().map(|&(corner, weight)| weight * onward.sigma[corner]).sum();
-            sigma.push(to_earlier.sigma[i].hypot(step_sigma));
+            let fetched = |values: &[f32]| -> f32 {
+                corners.iter().map(|&(corner, weight)| weight * values[corner]).sum()
+            };
+            sigma.push(to_earlier.sigma[i].hypot(fetched(&onward.sigma)));
+            links.push(to_earlier.links[i] + fetched(&onward.links));
         }
     }
-    Judged { flow, visible, sigma }
+    Judged { links, ..Judged::of(flow, visible, sigma) }
 }
 
+/// Share of the distance to the nearest candidate that disagrees in the standard deviation.
+const DOUBT: f32 = 0.45;
 /// Candidates closer than this support each other, pixels.
 const AGREE: f32 = 2.0;
 
@@ -47,6 +53,7 @@ pub(super) fn choose(candidates: &[Judged]) -> Judged {
         chosen.flow.v[i] = candidate.flow.v[i];
         chosen.visible[i] = candidate.visible[i];
         chosen.sigma[i] = candidate.sigma[i].hypot(doubt);
+        chosen.links[i] = candidate.links[i];
     }
     chosen
 }
@@ -71,7 +78,7 @@ fn choose_at(candidates: &[Judged], i: usize) -> (usize, f32) {
     let disagreeing =
         eligible().map(|(_, other)| distance(&candidates[index], other)).filter(|&d| d >= AGREE);
     let nearest = disagreeing.fold(f32::INFINITY, f32::min);
-    (index, if nearest.is_finite() { 0.5 * nearest } else { 0.0 })
+    (index, if nearest.is_finite() { DOUBT * nearest } else { 0.0 })
 }
 
 /// The way back along visible tracks, zero where none arrives; of several the most certain counts.
@@ -108,7 +115,7 @@ mod tests {
         let mut flow = Flow::zeros(width, height);
         flow.u.fill(u);
         flow.v.fill(v);
-        Judged { flow, visible: vec![visible; width * height], sigma: vec![sigma; width * height] }
+        Judged::of(flow, vec![visible; width * height], vec![sigma; width * height])
     }
 
     #[test]
@@ -116,6 +123,7 @@ mod tests {
         let chained = chain(&constant(1.5, -1.0, true, 3.0), &constant(0.25, 2.0, true, 4.0));
         assert!(chained.flow.u.iter().all(|&u| u == 1.75) && chained.flow.v.iter().all(|&v| v == 1.0));
         assert!(chained.sigma.iter().all(|&sigma| sigma == 5.0));
+        assert!(chained.links.iter().all(|&links| links == 2.0));
         // Column 7 ends at 8.75, outside.
         assert!(chained.visible[0] && !chained.visible[7]);
         assert!(!chain(&constant(0.0, 0.0, false, 1.0), &constant(0.0, 0.0, true, 1.0)).visible[0]);
@@ -135,7 +143,7 @@ mod tests {
         assert_eq!(pick(&[far.clone(), near.clone(), also_near.clone()]), (1.5, true, 1.0));
         assert_eq!(pick(&[hidden.clone(), near.clone()]), (1.0, true, 2.0));
         assert_eq!(pick(&[hidden.clone(), hidden]), (5.0, false, 0.01));
-        assert_eq!(pick(&[near, far]), (31.0, true, 0.1f32.hypot(15.0)));
+        assert_eq!(pick(&[near, far]), (31.0, true, 0.1f32.hypot(30.0 * DOUBT)));
     }
 
     #[test]

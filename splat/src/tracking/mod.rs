@@ -8,6 +8,7 @@
 mod chain;
 mod coarse;
 mod consistency;
+mod fill;
 mod flow;
 pub mod learned;
 mod matcher;

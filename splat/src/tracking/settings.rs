@@ -36,7 +36,7 @@ pub struct TrackingSettings {
     pub consistency: f32,
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
     pub correlation: f32,
-    /// Standard deviation that no track goes below, pixels; above 0, default 0.1.
+    /// Standard deviation that no track goes below, pixels; above 0, default 0.04.
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
     pub hidden_sigma: f32,
@@ -66,7 +66,7 @@ impl TrackingSettings {
             smoothing_iterations: 10,
             consistency: 1.5,
             correlation: 0.5,
-            sigma_floor: 0.1,
+            sigma_floor: 0.04,
             hidden_sigma: 16.0,
             onnx: OnnxSettings::default(),
         };

@@ -221,6 +221,94 @@ fn chaining_bridges_a_large_change_of_shape() {
     assert!(quantile(seen.iter().map(|&i| errors[i]).collect(), 0.9) < 2.0);
 }
 
+/// Errors of what is called visible that its standard deviation cannot explain, as a share of all pixels.
+fn dishonest(field: &TrackField, truth: impl Fn([f32; 2]) -> [f32; 2]) -> f64 {
+    let errors = errors(field, truth);
+    fraction((0..errors.len()).map(|i| field.visible[i] && errors[i] > 4.0 * field.sigma[i]))
+}
+
+#[test]
+fn half_a_turn_is_not_followed_and_this_is_admitted() {
+    let texture = Texture::new(12, 6.0);
+    let key = render(80, 64, |x, y| texture.at(x, y));
+    let turned = render(80, 64, |x, y| texture.at(80.0 - x, 64.0 - y));
+    let field = track(&[key, turned], &balanced()).remove(0);
+    // Patches are not turned: next to nothing is found, and three pixels in a hundred match elsewhere by chance.
+    let followed = errors(&field, |at| [80.0 - at[0], 64.0 - at[1]])
+        .iter()
+        .map(|&error| error < 2.0)
+        .collect::<Vec<_>>();
+    assert!(fraction(followed.into_iter()) < 0.1);
+    assert!(fraction(field.visible.iter().copied()) < 0.08);
+}
+
+#[test]
+fn a_stop_more_or_less_is_not_motion() {
+    let texture = Texture::new(13, 6.0);
+    // Half the range, so that the brighter frame is not clipped.
+    let scene = |x: f32, y: f32| texture.at(x, y).map(|value| 0.5 * value);
+    let key = render(96, 64, scene);
+    for gain in [0.5f32, 2.0] {
+        let other = render(96, 64, |x, y| scene(x - 2.0, y + 1.0).map(|value| gain * value));
+        let field = track(&[key.clone(), other], &balanced()).remove(0);
+        let truth = |at: [f32; 2]| [at[0] + 2.0, at[1] - 1.0];
+        assert!(dishonest(&field, truth) < 0.02, "gain {gain}");
+        let errors = errors(&field, truth);
+        let followed = (0..errors.len()).map(|i| field.visible[i] && errors[i] < 1.0);
+        // Windows are compared up to an offset, not up to a gain: twice the light costs most of the tracks, not their
+        // honesty.
+        assert!(fraction(followed) > if gain < 1.0 { 0.4 } else { 0.2 }, "gain {gain}");
+    }
+}
+
+#[test]
+fn what_leaves_the_image_is_hidden() {
+    let texture = Texture::new(14, 5.0);
+    let frames = [0.0, 30.0, 60.0].map(|shift| render(96, 64, |x, y| texture.at(x + shift, y)));
+    for (field, shift) in track(&frames, &balanced()).iter().zip([30.0, 60.0]) {
+        // The columns at the border see half of their windows.
+        let outside = (0..96 * 64).filter(|i| ((i % 96) as f32) < shift - 3.0);
+        assert!(fraction(outside.map(|i| field.visible[i])) < 0.05, "{shift}");
+        assert!(dishonest(field, |at| [at[0] - shift, at[1]]) < 0.02, "{shift}");
+    }
+}
+
+#[test]
+fn what_reappears_is_found_again_by_the_direct_match() {
+    // A bar covers the square in frames 2 and 3: no chain of gap 1 or 2 leads through both.
+    let (wall, square, bar) = (Texture::new(15, 7.0), Texture::new(16, 5.0), Texture::new(17, 9.0));
+    let scene = |t: usize| {
+        let (left, covered) = (30.0 + 3.0 * t as f32, t == 2 || t == 3);
+        render(128, 80, |x, y| {
+            if covered && (20.0..80.0).contains(&x) {
+                return bar.at(x, y).map(|value| 1.0 - value);
+            }
+            let inside = (left..left + 32.0).contains(&x) && (24.0..56.0).contains(&y);
+            if inside { square.at(x - left, y) } else { wall.at(x, y) }
+        })
+    };
+    let frames: Vec<_> = (0..5).map(scene).collect();
+    let fields = track(&frames, &balanced());
+    let core = || (0..128 * 80).filter(|i| (36..56).contains(&(i % 128)) && (30..50).contains(&(i / 128)));
+    for covered in [1, 2] {
+        assert!(fraction(core().map(|i| fields[covered].visible[i])) < 0.05);
+    }
+    let errors = errors(&fields[3], |at| [at[0] + 12.0, at[1]]);
+    assert!(fraction(core().map(|i| fields[3].visible[i] && errors[i] < 0.5)) > 0.9);
+}
+
+#[test]
+fn frames_beyond_the_longest_gap_are_forgotten() {
+    let texture = Texture::new(18, 5.0);
+    let settings = TrackingSettings { gaps: vec![1, 3], ..balanced() };
+    let key = render(24, 16, |x, y| texture.at(x, y));
+    let mut tracker = view::Tracker::new(&key, &settings, &matcher::PatchSearch);
+    for index in 1..12 {
+        tracker.track(index, &key).unwrap();
+        assert_eq!(tracker.remembered(), index.min(3));
+    }
+}
+
 #[test]
 fn textureless_frames_admit_that_they_know_nothing() {
     let grey = Arc::new(Image::filled(64, 48, [0.5; 3]));

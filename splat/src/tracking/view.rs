@@ -5,6 +5,7 @@ use std::{collections::VecDeque, convert::Infallible, sync::Arc};
 use super::{
     TrackField, TrackingSettings, chain,
     consistency::{self, Judged},
+    fill,
     flow::Flow,
     matcher::{PairMatcher, PatchSearch, Ways},
     pair::{Frame, Guides},
@@ -100,7 +101,7 @@ fn unknown_sigma(width: u32, height: u32) -> f32 {
     width.max(height).max(1) as f32
 }
 
-struct Tracker<'a, M> {
+pub(super) struct Tracker<'a, M> {
     settings: &'a TrackingSettings,
     matcher: &'a M,
     width: u32,
@@ -111,7 +112,7 @@ struct Tracker<'a, M> {
 }
 
 impl<'a, M: PairMatcher> Tracker<'a, M> {
-    fn new(key: &Image, settings: &'a TrackingSettings, matcher: &'a M) -> Self {
+    pub(super) fn new(key: &Image, settings: &'a TrackingSettings, matcher: &'a M) -> Self {
         let frame = Frame::new(key, settings);
         let key_texture = consistency::texture(&frame);
         Self {
@@ -125,14 +126,16 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         }
     }
 
-    fn track(&mut self, index: usize, image: &Image) -> Result<TrackField, M::Error> {
+    pub(super) fn track(&mut self, index: usize, image: &Image) -> Result<TrackField, M::Error> {
         let frame = Frame::new(image, self.settings);
         let chains = self.chains(index, &frame)?;
         let guess = (!chains.is_empty()).then(|| chain::choose(&chains));
         let direct = self.direct(&frame, guess.as_ref())?;
         // The direct match comes first: of equals, the one that cannot have drifted.
         let candidates: Vec<Judged> = std::iter::once(direct).chain(chains).collect();
-        let tracks = self.anchored(&frame, chain::choose(&candidates));
+        let mut tracks = chain::choose(&candidates);
+        fill::fill_hidden(&mut tracks, &self.key.levels[0].interiors());
+        let tracks = self.anchored(&frame, tracks);
         let field = self.field(&tracks);
 
         let texture = consistency::texture(&frame);
@@ -142,6 +145,12 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
             self.past.pop_front();
         }
         Ok(field)
+    }
+
+    /// Frames that later ones may be chained to.
+    #[cfg(test)]
+    pub(super) fn remembered(&self) -> usize {
+        self.past.len()
     }
 
     /// The tracks of earlier frames, continued to this one.
@@ -176,8 +185,9 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
     /// The tracks, refined once more against the key frame itself.
     fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
         let flow = self.matcher.anchored(&self.key, frame, &tracks, self.settings);
+        let before = tracks.flow;
         let mut anchored = Judged { flow, ..tracks };
-        consistency::widen_at_boundaries(&mut anchored);
+        consistency::account_for_alignment(&mut anchored, &before);
         anchored
     }
 
@@ -205,7 +215,8 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
                 let [u, v] = flow.sample(fx, fy);
                 let corners = flow.corners(fx, fy);
                 let visible = corners.iter().all(|&(corner, weight)| weight < 0.05 || tracks.visible[corner]);
-                let sigma: f32 = corners.iter().map(|&(corner, weight)| weight * tracks.sigma[corner]).sum();
+                let stated = |corner| tracks.stated_sigma(corner, self.settings.sigma_floor);
+                let sigma: f32 = corners.iter().map(|&(corner, weight)| weight * stated(corner)).sum();
                 let position = [x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale];
                 let sigma = sigma * scale + if visible { 0.0 } else { self.settings.hidden_sigma };
                 if position[0].is_finite() && position[1].is_finite() && sigma.is_finite() && sigma > 0.0 {

@@ -6,6 +6,7 @@ use npyz::WriterBuilder;
 use zip::{ZipWriter, write::SimpleFileOptions};
 
 use super::*;
+use crate::metrics::tracks::PointQuery;
 
 /// An npz under construction.
 pub(super) struct Npz {
@@ -40,6 +41,18 @@ impl Npz {
         let options = npyz::WriteOptions::new().default_dtype().order(order).shape(shape);
         let mut writer = options.writer(&mut bytes).begin_nd().unwrap();
         writer.extend(values.iter().copied()).unwrap();
+        writer.finish().unwrap();
+        self.zip.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
+        self.zip.write_all(&bytes).unwrap();
+        self
+    }
+
+    fn texts(mut self, name: &str, values: &[&str]) -> Self {
+        let dtype = npyz::DType::Plain("<U6".parse().unwrap());
+        let mut bytes = Vec::new();
+        let options = npyz::WriteOptions::new().dtype(dtype).shape(&[values.len() as u64]);
+        let mut writer = options.writer(&mut bytes).begin_nd().unwrap();
+        writer.extend(values.iter().map(|value| (*value).to_owned())).unwrap();
         writer.finish().unwrap();
         self.zip.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
         self.zip.write_all(&bytes).unwrap();
@@ -239,4 +252,57 @@ fn shapes_that_boast_are_refused() {
     let (_folder, path) = npz.finish();
     let message = read_track_npz(&path).unwrap_err().to_string();
     assert!(message.contains("needs more than"), "{message}");
+}
+
+#[test]
+fn validity_is_read_apart_and_must_fit_the_size() {
+    let (_folder, path) = flow().array("valid", &[2], &[0b0111_1110_u8, 0x80]).finish();
+    let valid = read_exact_validity(&path, 3, 3).unwrap();
+    assert_eq!(valid, [false, true, true, true, true, true, true, false, true]);
+    let error = read_exact_validity(&path, 5, 5).unwrap_err().to_string();
+    assert!(error.contains("[2]") && error.contains("[4]"), "{error}");
+}
+
+/// Two frames of three points, seen by two views.
+fn points() -> Npz {
+    let xyz =
+        [0.0_f32, 0.0, 2.0, 0.5, 0.0, 1.0, 0.0, 0.0, -1.0, 0.5, 0.25, 2.0, 9.0, 0.0, 1.0, 0.0, 0.0, 1.0];
+    Npz::new().array("xyz", &[2, 3, 3], &xyz).texts("cameras", &["a", "test00"]).array(
+        "dynamic",
+        &[3],
+        &[true, false, true],
+    )
+}
+
+#[test]
+fn points_are_projected_and_asked_for_where_the_key_frame_sees_them() {
+    let bits = [0b1110_0000_u8, 0b0110_0000, 0b1010_0000, 0b0000_0000];
+    let (_folder, path) = points().array("visible", &[2, 2, 1], &bits).finish();
+    let points = PointTracks::read(&path).unwrap();
+    let camera = crate::cameras::Camera {
+        width: 20,
+        height: 10,
+        fx: 8.0,
+        fy: 8.0,
+        cx: 10.0,
+        cy: 5.0,
+        rotation: glam::DMat3::IDENTITY,
+        translation: glam::DVec3::ZERO,
+    };
+    let asked = |view: &str, frame: usize, moving: bool| points.queries(view, &camera, frame, moving);
+    let query = |at_key: [f64; 2], exact: [f64; 2], visible: bool| PointQuery { at_key, exact, visible };
+    // The third point starts behind the camera.
+    assert_eq!(asked("a", 1, true).unwrap(), [query([10.0, 5.0], [12.0, 6.0], true)]);
+    assert_eq!(asked("a", 1, false).unwrap(), [query([14.0, 5.0], [82.0, 5.0], false)]);
+    assert_eq!(asked("a", 0, false).unwrap(), [query([14.0, 5.0], [14.0, 5.0], true)]);
+    assert_eq!(asked("test00", 1, true).unwrap(), []);
+    assert_eq!(asked("test00", 1, false).unwrap().len(), 1);
+    assert_eq!((asked("b", 1, true), asked("a", 2, true)), (None, None));
+}
+
+#[test]
+fn points_of_another_shape_are_refused() {
+    let (_folder, path) = points().array("visible", &[2, 1, 1], &[0_u8; 2]).finish();
+    let error = PointTracks::read(&path).unwrap_err().to_string();
+    assert!(error.contains("`visible`") && error.contains("[2, 2, 1]"), "{error}");
 }

@@ -1,0 +1,171 @@
+//! What `track` and `eval-tracks` share: which views and frames of a clip, and how they are tracked.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use splat::{
+    clip::{Clip, ClipOptions, Split},
+    tracking::{TrackField, TrackingSettings, track_view},
+};
+
+use crate::{
+    args::QualityArg,
+    error::CliError,
+    frame_range::FrameRange,
+    layers::SettingsLayers,
+    scratch::{self, OpenedClip},
+};
+
+/// Views and frames of a clip.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ViewsArgs {
+    /// Folder of the clip (COLMAP, nerfstudio transforms, or LLFF/N3DV).
+    pub(crate) clip: PathBuf,
+
+    /// Frames to track, first and last; the first is the key frame [default: all].
+    #[arg(long, value_name = "1..10", help_heading = "Input")]
+    pub(crate) frames: Option<FrameRange>,
+
+    /// Views to track [default: the training views].
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', help_heading = "Input")]
+    pub(crate) views: Vec<String>,
+}
+
+/// How the built-in tracker is set.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TrackerArgs {
+    /// How much time to trade for accuracy.
+    #[arg(long, value_enum, default_value_t, help_heading = "Tracking")]
+    pub(crate) quality: QualityArg,
+
+    /// TOML file of settings, over the preset of --quality; its [tracking] section counts.
+    #[arg(long, value_name = "FILE", help_heading = "Tracking")]
+    pub(crate) settings: Option<PathBuf>,
+
+    /// One setting by its dotted key, over --settings, as tracking.gaps=[1,2,4]; may be repeated.
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "Tracking")]
+    pub(crate) set: Vec<String>,
+}
+
+impl TrackerArgs {
+    /// The settings that all layers together make.
+    pub(crate) fn settings(&self) -> Result<TrackingSettings, CliError> {
+        if let Some(other) = self.set.iter().find(|assignment| !assignment.trim().starts_with("tracking.")) {
+            let why = "tracking has no such setting; its keys begin with 'tracking.'";
+            return Err(CliError::bad_input(format!("--set {other}"), why));
+        }
+        let layers = SettingsLayers {
+            quality: self.quality.into(),
+            file: self.settings.as_deref(),
+            assignments: &self.set,
+            ..SettingsLayers::default()
+        };
+        Ok(layers.resolve()?.tracking)
+    }
+}
+
+/// A clip and those of its views that are meant.
+#[derive(Debug)]
+pub(crate) struct ChosenViews {
+    opened: OpenedClip,
+    /// Positions among the clip's views.
+    pub(crate) positions: Vec<usize>,
+}
+
+impl ChosenViews {
+    pub(crate) fn open(args: &ViewsArgs) -> Result<Self, CliError> {
+        let options = ClipOptions {
+            frames: args.frames.map(|range| (range.first, range.last)),
+            // Every image is looked at once.
+            cache_bytes: 0,
+            ..ClipOptions::default()
+        };
+        let opened = scratch::open(&args.clip, &options, None)
+            .map_err(|error| CliError::BadInput(error.to_string()))?;
+        let positions = positions(&opened.clip, &args.views)?;
+        if opened.clip.frames().len() < 2 {
+            let why = format!("tracks need two frames, there are {}", opened.clip.frames().len());
+            return Err(CliError::bad_input(args.clip.display(), format!("{why}; --frames takes more")));
+        }
+        Ok(Self { opened, positions })
+    }
+
+    pub(crate) fn clip(&self) -> &Clip {
+        &self.opened.clip
+    }
+
+    pub(crate) fn name(&self, position: usize) -> &str {
+        &self.clip().views()[position].name
+    }
+
+    /// Tracks of one view by the built-in tracker, given frame by frame: `take(i, field)`, from index 1.
+    pub(crate) fn track(
+        &self,
+        position: usize,
+        settings: &TrackingSettings,
+        take: &mut dyn FnMut(usize, TrackField) -> Result<(), CliError>,
+    ) -> Result<(), CliError> {
+        let clip = self.clip();
+        let mut load =
+            |index: usize| clip.image(position, index).map_err(|error| CliError::BadInput(error.to_string()));
+        track_view(clip.frames().len(), &mut load, settings, take)
+    }
+
+    /// The file of each chosen view: by name where every file is named after a chosen view, else by order.
+    pub(crate) fn files<'a>(&self, files: &'a [PathBuf]) -> Result<Vec<&'a Path>, CliError> {
+        let names: Vec<&str> = self.positions.iter().map(|&position| self.name(position)).collect();
+        let stem = |file: &'a PathBuf| file.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+        let by_name = files.iter().all(|file| names.contains(&stem(file)));
+        let of_view = |(rank, name): (usize, &&str)| {
+            let found = if by_name { files.iter().find(|file| stem(file) == *name) } else { files.get(rank) };
+            found.map(PathBuf::as_path).ok_or_else(|| {
+                CliError::bad_input(
+                    "--tracks",
+                    format!(
+                        "no file for view '{name}' among {}; give one npz per view, in view order or named after the \
+                         views, or choose views with --views",
+                        files.len()
+                    ),
+                )
+            })
+        };
+        names.iter().enumerate().map(of_view).collect()
+    }
+}
+
+fn positions(clip: &Clip, names: &[String]) -> Result<Vec<usize>, CliError> {
+    let views = clip.views();
+    if names.is_empty() {
+        let training = (0..views.len()).filter(|&position| views[position].split == Split::Train);
+        return Ok(training.collect());
+    }
+    let mut found = Vec::new();
+    for name in names {
+        let position = views.iter().position(|view| view.name == *name).ok_or_else(|| {
+            let known: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
+            CliError::bad_input(format!("view '{name}'"), format!("the views are {}", known.join(", ")))
+        })?;
+        if !found.contains(&position) {
+            found.push(position);
+        }
+    }
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_settings_of_the_tracker_are_taken() {
+        let args =
+            |set: &str| TrackerArgs { quality: QualityArg::Draft, settings: None, set: vec![set.to_owned()] };
+        let settings = args("tracking.gaps=[1, 4]").settings();
+        assert!(settings.is_ok_and(|settings| settings.gaps == [1, 4]));
+        for wrong in ["refine.iterations=3", "tracking.no_such=3", "seed=1"] {
+            let error = args(wrong).settings().expect_err(wrong);
+            assert_eq!(error.exit_code(), 3);
+            assert!(error.to_string().contains(wrong), "{error}");
+        }
+    }
+}

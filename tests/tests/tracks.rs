@@ -1,0 +1,100 @@
+//! `track` and `eval-tracks` as commands.
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use std::path::Path;
+
+use serde_json::Value;
+use trackersplat_tests::{clips, program};
+
+/// The cheapest tracks: what is said of them matters here, not how good they are.
+const QUICK: [&str; 4] = ["--quality", "draft", "--set", "tracking.max_side=160"];
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Runs a command that must succeed; what it said on standard output and error.
+fn succeeds(arguments: &[&str]) -> String {
+    let (code, said) = program::run(arguments);
+    assert_eq!(code, 0, "{arguments:?}:\n{said}");
+    said
+}
+
+/// Runs a command that must find its input bad, and say all of `parts`.
+fn is_refused(arguments: &[&str], parts: &[&str]) {
+    let (code, said) = program::run(arguments);
+    assert_eq!(code, 3, "{arguments:?}:\n{said}");
+    for part in parts {
+        assert!(said.contains(part), "{part} in:\n{said}");
+    }
+}
+
+#[test]
+fn tracks_are_written_pictured_and_measure_the_same_from_the_file() {
+    let clip = clips::scratch(2, 2);
+    let clip = text(clip.path());
+    let folder = tempfile::tempdir().unwrap();
+    let (out, pictures) = (folder.path().join("tracks"), folder.path().join("pictures"));
+    let line = [&["track", clip, "--out", text(&out), "--pictures", text(&pictures), "--quiet"], &QUICK[..]];
+    let said = succeeds(&line.concat());
+    let files = ["cam00", "cam01"].map(|view| out.join(format!("{view}.npz")));
+    for (view, file) in ["cam00", "cam01"].iter().zip(&files) {
+        assert!(said.contains(text(file)) && file.exists(), "{said}");
+        for kind in ["flow", "tracks", "uncertainty"] {
+            let picture = image::open(pictures.join(view).join(format!("{kind}_0002.png"))).unwrap();
+            assert_eq!((picture.width(), picture.height()), (320, 180));
+        }
+    }
+
+    let errors = folder.path().join("errors");
+    let own = [&["eval-tracks", clip, "--json", "--quiet", "--pictures", text(&errors)], &QUICK[..]].concat();
+    let own: Value = serde_json::from_str(&succeeds(&own)).unwrap();
+    // The second view's file first: names decide, not the order.
+    let from_files = ["eval-tracks", clip, "--json", "--quiet", "--tracks", text(&files[1]), text(&files[0])];
+    let from_files: Value = serde_json::from_str(&succeeds(&from_files)).unwrap();
+    assert_eq!(own, from_files);
+    assert!(errors.join("cam01/error_0002.png").exists());
+
+    assert_eq!(own["views"], serde_json::json!(["cam00", "cam01"]));
+    let moving = &own["pixels"]["moving"]["endpoint"];
+    // Objects of the clip move by 40 px and more.
+    assert!(moving["pixels"].as_u64().unwrap() > 1000 && moving["median"].as_f64().unwrap() < 2.0, "{own}");
+    assert_eq!(own["pixels"]["all"]["deciles"].as_array().unwrap().len(), 10);
+    assert_eq!(own["points"], Value::Null);
+    assert_eq!(own["by_frame"][0]["frame"], 2);
+}
+
+#[test]
+fn one_view_goes_to_one_file_and_a_table_is_printed() {
+    let clip = clips::scratch(2, 1);
+    let clip = text(clip.path());
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("any.npz");
+    succeeds(&[&["track", clip, "--out", text(&file), "--quiet"], &QUICK[..]].concat());
+    let table = succeeds(&["eval-tracks", clip, "--tracks", text(&file), "--quiet"]);
+    for word in ["EPE px", "moving", "precision", "68.3 %", "decile"] {
+        assert!(table.contains(word), "{word} in:\n{table}");
+    }
+    let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().collect();
+    assert_eq!(left.len(), 1, "{left:?}");
+}
+
+#[test]
+fn wrong_input_names_what_is_wrong_and_the_remedy() {
+    let folder = clips::scratch(2, 2);
+    let clip = text(folder.path());
+    let out = tempfile::tempdir().unwrap();
+    let file = out.path().join("one.npz");
+    is_refused(&["track", clip, "--out", text(&file)], &["one.npz", "2 views", "--views"]);
+    let line = ["track", clip, "--out", text(&file), "--views", "cam07"];
+    is_refused(&line, &["'cam07'", "cam00, cam01, test00"]);
+    let line = ["track", clip, "--out", text(&file), "--views", "cam00", "--frames", "2..2"];
+    is_refused(&line, &["two frames", "--frames"]);
+    let line = ["track", clip, "--out", text(&file), "--set", "refine.iterations=3"];
+    is_refused(&line, &["refine.iterations=3", "tracking."]);
+    is_refused(&["eval-tracks", clip, "--views", "test00"], &["flow/test00.npz", "--views"]);
+    is_refused(&["eval-tracks", clip, "--tracks", text(&file)], &["cam01", "one npz per view"]);
+    is_refused(&["eval-tracks", clip, "--views", "cam00", "--tracks", text(&file)], &["one.npz"]);
+    let (code, said) = program::run(["eval-tracks", clip, "--tracks", text(&file), "--quality", "best"]);
+    assert_eq!(code, 2, "{said}");
+}
