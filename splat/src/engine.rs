@@ -162,8 +162,8 @@ impl DensityStatistics {
 
 /// Parameters, optimiser state and images kept on a device between steps.
 pub trait Session: Send {
-    /// One optimisation step on view `view` of the session's input. A device may still be at work on it afterwards: nothing
-    /// waits for it but the methods that read something back.
+    /// One optimisation step on view `view` of the session's input. A device may still be at work on it, and on a few before it,
+    /// afterwards: only the methods that read something back wait for it.
     fn step(&mut self, view: usize, rates: &LearningRates) -> Result<(), EngineError>;
 
     /// Reads back the losses, each before its update, of the steps since this was last asked, oldest first.
