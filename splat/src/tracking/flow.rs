@@ -40,19 +40,13 @@ impl Flow {
         [&self.u, &self.v].map(|axis| corners.iter().map(|&(i, weight)| weight * axis[i]).sum())
     }
 
-    /// The same field on a grid of another size, displacements scaled along; `scale` is new over old resolution.
-    /// The nearest value, so that motion boundaries stay sharp.
-    pub(super) fn resampled_nearest(&self, width: usize, height: usize, scale: f32) -> Self {
-        let mut out = Self::zeros(width, height);
-        for y in 0..height {
-            let source_y = (((y as f32 + 0.5) / scale) as usize).min(self.height - 1);
-            for x in 0..width {
-                let source_x = (((x as f32 + 0.5) / scale) as usize).min(self.width - 1);
-                let at = self.at(source_x, source_y);
-                out.u[y * width + x] = at[0] * scale;
-                out.v[y * width + x] = at[1] * scale;
-            }
+    /// Resolution of an image over that of a field that was found on it after halvings, each of which rounds up: a power
+    /// of two, not the ratio of the sizes.
+    pub(super) fn reduction(width: usize, height: usize, field_width: usize, field_height: usize) -> f32 {
+        let mut halvings = 0;
+        while width.div_ceil(1 << halvings) > field_width || height.div_ceil(1 << halvings) > field_height {
+            halvings += 1;
         }
-        out
+        (1u32 << halvings) as f32
     }
 }

@@ -8,16 +8,21 @@
 mod chain;
 mod coarse;
 mod consistency;
+mod densify;
 mod flow;
 mod pair;
+mod pair_flow;
 mod patches;
 mod planes;
 mod refine;
 mod settings;
 #[cfg(test)]
 mod tests;
+mod texels;
 mod view;
+mod windows;
 
+pub use pair_flow::{DenseFlow, PairFlow, SizesDiffer, pair_flow};
 pub use settings::TrackingSettings;
 pub use view::track_view;
 

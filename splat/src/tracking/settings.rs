@@ -16,6 +16,8 @@ pub struct TrackingSettings {
     /// Largest displacement between two frames that the exhaustive search finds, as a fraction of the width; 0 to 1,
     /// default 0.4.
     pub search_radius: f32,
+    /// TEMP
+    pub colour: u32,
     /// Distances in frames over which tracks are chained besides the direct match with the key frame; each at least
     /// 1, default 1 and 2.
     pub gaps: Vec<u32>,
@@ -54,6 +56,7 @@ impl TrackingSettings {
             max_side: 800,
             search_side: 100,
             search_radius: 0.4,
+            colour: 3,
             gaps: vec![1, 2],
             patch_stride: 3,
             patch_iterations: 12,

@@ -7,7 +7,6 @@ use super::{
     consistency::{self, Judged},
     flow::Flow,
     pair::{Frame, Guides, match_frames},
-    refine::{Smoothing, refine},
 };
 use crate::image::Image;
 
@@ -131,7 +130,7 @@ impl<'a> Tracker<'a> {
     fn direct(&self, frame: &Frame, guess: Option<&Judged>) -> Judged {
         let back: Option<Flow> = guess.map(chain::inverted);
         let guides = match (guess, &back) {
-            (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward }),
+            (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward, scale: 1.0 }),
             _ => None,
         };
         let (flow, back) = match_frames(&self.key, frame, guides, self.settings);
@@ -140,14 +139,7 @@ impl<'a> Tracker<'a> {
 
     /// The tracks, refined once more against the key frame itself.
     fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
-        let smoothing = Smoothing::of(self.settings);
-        let flow = refine(
-            &self.key.reference(0),
-            &frame.reference(0),
-            &tracks.flow,
-            Some(&tracks.visible),
-            smoothing,
-        );
+        let flow = self.key.refined(frame, tracks.flow, &tracks.visible, self.settings);
         let mut anchored = Judged { flow, ..tracks };
         consistency::widen_at_boundaries(&mut anchored);
         anchored
@@ -157,13 +149,7 @@ impl<'a> Tracker<'a> {
     fn field(&self, tracks: &Judged) -> TrackField {
         let (width, height) = (self.width as usize, self.height as usize);
         let flow = &tracks.flow;
-        // Every halving rounds up, so the scale is the power of two, not the ratio of the sizes.
-        let mut scale = 1.0;
-        while (width as f32 / scale).ceil() as usize > flow.width
-            || (height as f32 / scale).ceil() as usize > flow.height
-        {
-            scale *= 2.0;
-        }
+        let scale = Flow::reduction(width, height, flow.width, flow.height);
         let mut field = TrackField {
             width: self.width,
             height: self.height,
