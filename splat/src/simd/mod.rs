@@ -79,6 +79,7 @@ pub(crate) trait Simd: Copy {
 
     /// Each argument half of the lanes.
     fn load_halves(halves: [&[f32; LANES / 2]; 2]) -> Self;
+    fn store_halves(self, to: [&mut [f32; LANES / 2]; 2]);
     /// The upper half of `self`, then the lower half of `next`.
     fn straddle(self, next: Self) -> Self;
 

@@ -114,6 +114,12 @@ impl Simd for Plain {
     }
 
     #[inline(always)]
+    fn store_halves(self, [low, high]: [&mut [f32; LANES / 2]; 2]) {
+        low.copy_from_slice(&self.0[..LANES / 2]);
+        high.copy_from_slice(&self.0[LANES / 2..]);
+    }
+
+    #[inline(always)]
     fn straddle(self, next: Self) -> Self {
         let half = LANES / 2;
         Self(std::array::from_fn(|lane| if lane < half { self.0[lane + half] } else { next.0[lane - half] }))

@@ -91,6 +91,13 @@ impl Simd for Avx512 {
         })
     }
     #[inline(always)]
+    fn store_halves(self, [low, high]: [&mut [f32; LANES / 2]; 2]) {
+        intrinsic!({
+            _mm256_storeu_ps(low.as_mut_ptr(), _mm512_castps512_ps256(self.0));
+            _mm256_storeu_ps(high.as_mut_ptr(), _mm512_extractf32x8_ps::<1>(self.0));
+        });
+    }
+    #[inline(always)]
     fn straddle(self, next: Self) -> Self {
         Self(intrinsic!(_mm512_shuffle_f32x4::<0x4E>(self.0, next.0)))
     }
@@ -283,6 +290,11 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn load_halves([low, high]: [&[f32; LANES / 2]; 2]) -> Self {
         intrinsic!(Self(_mm256_loadu_ps(low.as_ptr()), _mm256_loadu_ps(high.as_ptr())))
+    }
+    #[inline(always)]
+    fn store_halves(self, [low, high]: [&mut [f32; LANES / 2]; 2]) {
+        intrinsic!(_mm256_storeu_ps(low.as_mut_ptr(), self.0));
+        intrinsic!(_mm256_storeu_ps(high.as_mut_ptr(), self.1));
     }
     #[inline(always)]
     fn straddle(self, next: Self) -> Self {

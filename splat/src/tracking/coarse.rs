@@ -10,7 +10,8 @@ use super::{
 };
 use crate::simd::{Instructions, Simd, simd_kernel};
 
-/// The best match of every pixel of one image in the other, in pixels of the searched level.
+/// The best match of every pixel of one image in the other, in pixels of the searched level; not a number where it
+/// does not lead back.
 pub(super) struct CoarseMatches {
     pub(super) forward: Flow,
     pub(super) backward: Flow,
@@ -20,6 +21,9 @@ pub(super) struct CoarseMatches {
 const RADIUS: usize = 2;
 /// Half side of the windows whose mean is removed first. Wide, so that a patch keeps its colour.
 const HIGH_PASS_RADIUS: usize = 6;
+
+/// Largest distance along either axis between a pixel and where it comes back to, pixels.
+const ROUND_TRIP: f32 = 1.0;
 
 struct Best {
     cost: Vec<f32>,
@@ -53,10 +57,10 @@ impl Best {
 /// Compares every pixel's window with all windows at most `radius` pixels away along either axis.
 ///
 /// Of equal costs the smallest displacement wins, so identical images match at zero.
-pub(super) fn search(
+pub(super) fn search<const C: usize>(
     instructions: Instructions,
-    first: &Planes,
-    second: &Planes,
+    first: &Planes<C>,
+    second: &Planes<C>,
     radius: usize,
 ) -> CoarseMatches {
     let (width, height) = (first.width, first.height);
@@ -65,20 +69,40 @@ pub(super) fn search(
     let mut matches = [Best::new(width * height), Best::new(width * height)];
     compare_all(instructions, &images, &displacements, &mut matches);
     let [forward, backward] = matches;
-    CoarseMatches {
-        forward: forward.into_flow(width, &displacements, 1.0),
-        backward: backward.into_flow(width, &displacements, -1.0),
+    let mut forward = forward.into_flow(width, &displacements, 1.0);
+    let mut backward = backward.into_flow(width, &displacements, -1.0);
+    let unverified = forward.clone();
+    verify(&mut forward, &backward);
+    verify(&mut backward, &unverified);
+    CoarseMatches { forward, backward }
+}
+
+/// Marks matches that do not lead back as not found.
+fn verify(flow: &mut Flow, back: &Flow) {
+    for y in 0..flow.height {
+        for x in 0..flow.width {
+            let i = y * flow.width + x;
+            let (u, v) = (flow.u[i], flow.v[i]);
+            let [bu, bv] = back.at((x as f32 + u) as usize, (y as f32 + v) as usize);
+            if !((u + bu).abs() <= ROUND_TRIP && (v + bv).abs() <= ROUND_TRIP) {
+                flow.u[i] = f32::NAN;
+            }
+        }
     }
 }
 
 simd_kernel! {
-    fn compare_all(
-        images: &[Planes; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
+    fn compare_all<const C: usize>(
+        images: &[Planes<C>; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
     ) = compare_kernel
 }
 
 #[inline(always)]
-fn compare_kernel<S: Simd>(images: &[Planes; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2]) {
+fn compare_kernel<S: Simd, const C: usize>(
+    images: &[Planes<C>; 2],
+    displacements: &[[i32; 2]],
+    matches: &mut [Best; 2],
+) {
     let (width, height) = (images[0].width, images[0].height);
     let mut scratch = Scratch::default();
     let mut energies = [vec![0.0f32; width * height], vec![0.0f32; width * height]];
@@ -112,7 +136,7 @@ fn compare_kernel<S: Simd>(images: &[Planes; 2], displacements: &[[i32; 2]], mat
 }
 
 /// Binomial smoothing: a displacement of half a coarse pixel must not hide a match.
-fn smoothed(planes: &Planes) -> Planes {
+fn smoothed<const C: usize>(planes: &Planes<C>) -> Planes<C> {
     let interiors = planes.interiors().map(|channel| {
         // Two box filters of different size approximate the binomial well enough.
         let (width, height) = (planes.width, planes.height);
@@ -139,7 +163,7 @@ struct Overlap {
 }
 
 impl Overlap {
-    fn new(image: &Planes, displacement: [i32; 2]) -> Self {
+    fn new<const C: usize>(image: &Planes<C>, displacement: [i32; 2]) -> Self {
         let [dx, dy] = displacement;
         Self {
             displacement,
@@ -162,7 +186,7 @@ struct Scratch {
 impl Scratch {
     /// Sums along the rows of `first` that `second`, shifted, overlaps, and of `RADIUS` rows before and after.
     #[inline(always)]
-    fn sum_rows(&mut self, first: &Planes, second: &Planes, overlap: &Overlap) {
+    fn sum_rows<const C: usize>(&mut self, first: &Planes<C>, second: &Planes<C>, overlap: &Overlap) {
         let columns = overlap.columns;
         let padded = columns + 2 * RADIUS;
         let [dx, dy] = overlap.displacement.map(i64::from);

@@ -2,7 +2,7 @@
 
 use super::{
     flow::Flow,
-    patches::{PATCH_PIXELS, PatchField, Window, totals},
+    patches::{PATCH_PIXELS, PatchField, Window, line, totals},
     planes::{PATCH, Planes},
 };
 use crate::simd::{Instructions, LANES, Simd, simd_kernel};
@@ -63,6 +63,9 @@ simd_kernel! {
     fn paint<const C: usize>(reference: &Planes<C>, target: &Planes<C>, field: &PatchField, canvas: &mut Canvas) = paint_kernel
 }
 
+/// Rows of a patch that a group of lanes holds.
+const PAIRS: usize = PATCH / 2;
+
 #[inline(always)]
 fn paint_kernel<S: Simd, const C: usize>(
     reference: &Planes<C>,
@@ -75,42 +78,38 @@ fn paint_kernel<S: Simd, const C: usize>(
     for (j, &y) in field.ys.iter().enumerate() {
         for (i, &x) in field.xs.iter().enumerate() {
             let at = j * field.columns + i;
-            let [u, v] = field.displacement[at];
-            pixel_weights::<S, C>(reference, target, [x, y], [u, v], field.cost[at], &mut weights[at]);
-            for (row, weights) in weights[at].as_chunks::<PATCH>().0.iter().enumerate() {
-                let first = (y + row) * width + x;
-                let best_weight = &mut canvas.best_weight[first..first + PATCH];
-                let [best_u, best_v] = &mut canvas.best;
-                let best_u = &mut best_u[first..first + PATCH];
-                let best_v = &mut best_v[first..first + PATCH];
-                for k in 0..PATCH {
-                    let better = weights[k] > best_weight[k];
-                    best_u[k] = if better { u } else { best_u[k] };
-                    best_v[k] = if better { v } else { best_v[k] };
-                    best_weight[k] = if better { weights[k] } else { best_weight[k] };
-                }
+            let displacement = field.displacement[at];
+            pixel_weights::<S, C>(reference, target, [x, y], displacement, field.cost[at], &mut weights[at]);
+            let [u, v] = [S::splat(displacement[0]), S::splat(displacement[1])];
+            let [best_u, best_v] = &mut canvas.best;
+            for pair in 0..PAIRS {
+                let first = (y + 2 * pair) * width + x;
+                let weight = group::<S>(&weights[at], LANES * pair, PATCH);
+                let best: S = group(&canvas.best_weight, first, width);
+                let better = best.lt(weight);
+                put(S::select(better, weight, best), &mut canvas.best_weight, first, width);
+                put(S::select(better, u, group(best_u, first, width)), best_u, first, width);
+                put(S::select(better, v, group(best_v, first, width)), best_v, first, width);
             }
         }
     }
+    let (zero, near, far) = (S::splat(0.0), S::splat(SAME_MOTION), S::splat(-SAME_MOTION));
     for (j, &y) in field.ys.iter().enumerate() {
         for (i, &x) in field.xs.iter().enumerate() {
             let at = j * field.columns + i;
-            let [u, v] = field.displacement[at];
-            for (row, weights) in weights[at].as_chunks::<PATCH>().0.iter().enumerate() {
-                let first = (y + row) * width + x;
-                let best_u = &canvas.best[0][first..first + PATCH];
-                let best_v = &canvas.best[1][first..first + PATCH];
-                let [sum_u, sum_v] = &mut canvas.sum;
-                let sum_u = &mut sum_u[first..first + PATCH];
-                let sum_v = &mut sum_v[first..first + PATCH];
-                let total = &mut canvas.total[first..first + PATCH];
-                for k in 0..PATCH {
-                    let apart = (u - best_u[k]).abs().max((v - best_v[k]).abs());
-                    let weight = if apart > SAME_MOTION { 0.0 } else { weights[k] };
-                    sum_u[k] += weight * u;
-                    sum_v[k] += weight * v;
-                    total[k] += weight;
-                }
+            let [u, v] = [S::splat(field.displacement[at][0]), S::splat(field.displacement[at][1])];
+            let [sum_u, sum_v] = &mut canvas.sum;
+            for pair in 0..PAIRS {
+                let first = (y + 2 * pair) * width + x;
+                let weight = group::<S>(&weights[at], LANES * pair, PATCH);
+                let off_u = u.sub(group(&canvas.best[0], first, width));
+                let off_v = v.sub(group(&canvas.best[1], first, width));
+                let agrees_u = S::both(near.ge(off_u), off_u.ge(far));
+                let agrees_v = S::both(near.ge(off_v), off_v.ge(far));
+                let weight = S::select(S::both(agrees_u, agrees_v), weight, zero);
+                put(weight.mul_add(u, group(sum_u, first, width)), sum_u, first, width);
+                put(weight.mul_add(v, group(sum_v, first, width)), sum_v, first, width);
+                put(weight.add(group(&canvas.total, first, width)), &mut canvas.total, first, width);
             }
         }
     }
@@ -119,6 +118,21 @@ fn paint_kernel<S: Simd, const C: usize>(
         for (value, total) in axis.iter_mut().zip(&canvas.total) {
             *value /= total;
         }
+    }
+}
+
+/// Eight values from `first` on, and eight a row below.
+#[inline(always)]
+fn group<S: Simd>(values: &[f32], first: usize, width: usize) -> S {
+    S::load_halves([line(values, first), line(values, first + width)])
+}
+
+/// Writes what [`group`] reads.
+#[inline(always)]
+fn put<S: Simd>(group: S, values: &mut [f32], first: usize, width: usize) {
+    let (upper, lower) = values[first..].split_at_mut(width);
+    if let (Some(upper), Some(lower)) = (upper.first_chunk_mut(), lower.first_chunk_mut()) {
+        group.store_halves([upper, lower]);
     }
 }
 
@@ -131,28 +145,30 @@ fn pixel_weights<S: Simd, const C: usize>(
     cost: f32,
     weights: &mut [f32; PATCH_PIXELS],
 ) {
-    let here = Window::<S>::new(reference, x as f32, y as f32);
     let there = Window::<S>::new(target, x as f32 + u, y as f32 + v);
-    let channels = C as f32;
+    let here = reference.index(x, y);
     let scale = RESIDUAL_SCALE * RESIDUAL_SCALE;
-    let patch = 1.0 / (scale + cost / (channels * PATCH_PIXELS as f32));
-    let mut squares = [[0.0f32; LANES]; PATCH_PIXELS / LANES];
+    let patch = 1.0 / (scale + cost / (C * PATCH_PIXELS) as f32);
+    let mut squares = [S::splat(scale); PAIRS];
+    let none = S::splat(0.0);
     for (a, b) in reference.channels.iter().zip(&target.channels) {
         let mut off = there.fetch(b, target.stride);
-        let template = here.fetch(a, reference.stride);
-        for pair in 0..off.len() {
-            off[pair] = off[pair].sub(template[pair]);
+        for pair in 0..PAIRS {
+            let first = here + 2 * pair * reference.stride;
+            off[pair] = off[pair].sub(group(a, first, reference.stride));
         }
-        let none = S::splat(0.0);
         let sum = off[0].add(off[1]).add(off[2].add(off[3]));
         let mean = S::splat(totals([sum, none, none, none])[0] / PATCH_PIXELS as f32);
-        for (squares, off) in squares.iter_mut().zip(off) {
-            let off = off.sub(mean);
-            off.mul_add(off, S::load(squares)).store(squares);
+        for pair in 0..PAIRS {
+            let off = off[pair].sub(mean);
+            squares[pair] = off.mul(S::splat(1.0 / C as f32)).mul_add(off, squares[pair]);
         }
     }
-    let squares = squares.as_flattened();
-    for k in 0..PATCH_PIXELS {
-        weights[k] = patch / (scale + squares[k] / channels);
+    for (pair, weights) in weights.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+        let mut lanes = [0.0; LANES];
+        squares[pair].store(&mut lanes);
+        for (weight, square) in weights.iter_mut().zip(lanes) {
+            *weight = patch / square;
+        }
     }
 }

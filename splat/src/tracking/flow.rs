@@ -40,11 +40,28 @@ impl Flow {
         [&self.u, &self.v].map(|axis| corners.iter().map(|&(i, weight)| weight * axis[i]).sum())
     }
 
+    /// The same field on a grid of twice the resolution, displacements scaled along.
+    pub(super) fn doubled(&self, width: usize, height: usize, bilinear: bool) -> Self {
+        let mut out = Self::zeros(width, height);
+        for y in 0..height {
+            for x in 0..width {
+                let [u, v] = if bilinear {
+                    self.sample((x as f32 + 0.5) * 0.5 - 0.5, (y as f32 + 0.5) * 0.5 - 0.5)
+                } else {
+                    self.at(x / 2, y / 2)
+                };
+                out.u[y * width + x] = 2.0 * u;
+                out.v[y * width + x] = 2.0 * v;
+            }
+        }
+        out
+    }
+
     /// Resolution of an image over that of a field that was found on it after halvings, each of which rounds up: a power
     /// of two, not the ratio of the sizes.
-    pub(super) fn reduction(width: usize, height: usize, field_width: usize, field_height: usize) -> f32 {
+    pub(super) fn reduction(image: [usize; 2], field: [usize; 2]) -> f32 {
         let mut halvings = 0;
-        while width.div_ceil(1 << halvings) > field_width || height.div_ceil(1 << halvings) > field_height {
+        while image[0].div_ceil(1 << halvings) > field[0] || image[1].div_ceil(1 << halvings) > field[1] {
             halvings += 1;
         }
         (1u32 << halvings) as f32

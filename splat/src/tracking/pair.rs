@@ -15,19 +15,22 @@ use crate::{image::Image, simd::Instructions};
 const EDGE_SCALE: f32 = 40.0;
 
 /// One level of a frame's pyramid.
-pub(super) struct Level<const P: usize, const C: usize> {
-    pub(super) planes: Planes<P>,
-    pub(super) shown: Planes<C>,
+pub(super) struct Level<const C: usize> {
+    pub(super) planes: Planes<C>,
     pub(super) texels: Texels<C>,
     /// How alike each pixel is to its left and to its upper neighbour, 1 where equal; 0 where there is none.
     pub(super) similarity: [Vec<f32>; 2],
 }
 
-impl<const P: usize, const C: usize> Level<P, C> {
-    fn new(planes: Planes<P>, shown: Planes<C>) -> Self {
-        let texels = Texels::new(&shown);
-        let similarity = similarity(&shown);
-        Self { planes, shown, texels, similarity }
+impl<const C: usize> Level<C> {
+    fn pyramid(image: Planes<C>, settings: &TrackingSettings) -> Vec<Self> {
+        let finest = reduced(image, settings);
+        let level = |planes: Planes<C>| {
+            let texels = Texels::new(&planes);
+            let similarity = similarity(&planes);
+            Self { planes, texels, similarity }
+        };
+        pyramid(finest, settings.search_side as usize).into_iter().map(level).collect()
     }
 }
 
@@ -59,43 +62,56 @@ fn similarity<const C: usize>(planes: &Planes<C>) -> [Vec<f32>; 2] {
     similarity
 }
 
-enum Matched {
-    A(Vec<Level<1, 1>>),
-    B(Vec<Level<3, 1>>),
-    C(Vec<Level<1, 3>>),
-    D(Vec<Level<3, 3>>),
+/// What of a frame is matched: a pyramid, finest level first.
+pub(super) enum Pyramid {
+    Luma(Vec<Level<1>>),
+    Colour(Vec<Level<3>>),
 }
 
-/// A frame, prepared for matching.
+impl Pyramid {
+    /// The pyramid of an image that has pixels.
+    pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
+        if settings.colour {
+            Self::Colour(Level::pyramid(Planes::from_image(image), settings))
+        } else {
+            Self::Luma(Level::pyramid(Planes::luma_of(image), settings))
+        }
+    }
+
+    /// Columns and rows of the finest level.
+    pub(super) fn size(&self) -> [usize; 2] {
+        match self {
+            Self::Luma(levels) => levels[0].planes.size(),
+            Self::Colour(levels) => levels[0].planes.size(),
+        }
+    }
+}
+
+/// A frame, prepared for matching and for comparison.
 pub(super) struct Frame {
-    /// Pyramid in colour, finest first.
-    pub(super) levels: Vec<Planes>,
-    /// Gradients along x and y of the finest level.
+    /// The finest level, in colour.
+    pub(super) levels: [Planes; 1],
+    /// Its gradients along x and y.
     pub(super) gradients: [[Planes; 2]; 1],
-    matched: Matched,
+    pyramid: Pyramid,
 }
 
 impl Frame {
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        let finest = Planes::from_image(image);
-        // The pyramid down to the tracking resolution, of which only the end is kept.
-        let mut reduced = pyramid(finest, settings.max_side as usize);
-        let finest = reduced.swap_remove(reduced.len() - 1);
-        let levels = pyramid(finest, settings.search_side as usize);
-        let gradients = [levels[0].gradients()];
-        let matched = match settings.colour {
-            0 => Matched::A(levels.iter().map(|planes| Level::new(planes.luma(), planes.luma())).collect()),
-            1 => Matched::B(levels.iter().map(|planes| Level::new(planes.clone(), planes.luma())).collect()),
-            2 => Matched::C(levels.iter().map(|planes| Level::new(planes.luma(), planes.clone())).collect()),
-            _ => Matched::D(levels.iter().map(|planes| Level::new(planes.clone(), planes.clone())).collect()),
+        let pyramid = Pyramid::new(image, settings);
+        let finest = match &pyramid {
+            Pyramid::Colour(levels) => levels[0].planes.clone(),
+            Pyramid::Luma(_) => reduced(Planes::from_image(image), settings),
         };
-        Self { levels, gradients, matched }
+        Self { gradients: [finest.gradients()], levels: [finest], pyramid }
     }
 
+    /// Columns of the finest level.
     pub(super) fn width(&self) -> usize {
         self.levels[0].width
     }
 
+    /// Rows of the finest level.
     pub(super) fn height(&self) -> usize {
         self.levels[0].height
     }
@@ -108,33 +124,26 @@ impl Frame {
         trust: &[bool],
         settings: &TrackingSettings,
     ) -> Flow {
-        let smoothing = Smoothing::of(settings);
-        let i = Instructions::detect();
-        match (&self.matched, &other.matched) {
-            (Matched::A(a), Matched::A(b)) => refine(i, &a[0], &b[0], flow, Some(trust), smoothing),
-            (Matched::B(a), Matched::B(b)) => refine(i, &a[0], &b[0], flow, Some(trust), smoothing),
-            (Matched::C(a), Matched::C(b)) => refine(i, &a[0], &b[0], flow, Some(trust), smoothing),
-            (Matched::D(a), Matched::D(b)) => refine(i, &a[0], &b[0], flow, Some(trust), smoothing),
+        let (instructions, trust, smoothing) = (Instructions::detect(), Some(trust), Smoothing::of(settings));
+        match (&self.pyramid, &other.pyramid) {
+            (Pyramid::Luma(a), Pyramid::Luma(b)) => {
+                refine(instructions, &a[0], &b[0], flow, trust, smoothing)
+            }
+            (Pyramid::Colour(a), Pyramid::Colour(b)) => {
+                refine(instructions, &a[0], &b[0], flow, trust, smoothing)
+            }
+            // Frames of one view have one setting.
             _ => flow,
         }
     }
+}
 
-    fn descend(
-        &self,
-        to: &Self,
-        i: Instructions,
-        seeds: &Flow,
-        guide: Option<Guess<'_>>,
-        s: &TrackingSettings,
-    ) -> Flow {
-        match (&self.matched, &to.matched) {
-            (Matched::A(a), Matched::A(b)) => descend_pyramid(i, a, b, seeds, guide, s),
-            (Matched::B(a), Matched::B(b)) => descend_pyramid(i, a, b, seeds, guide, s),
-            (Matched::C(a), Matched::C(b)) => descend_pyramid(i, a, b, seeds, guide, s),
-            (Matched::D(a), Matched::D(b)) => descend_pyramid(i, a, b, seeds, guide, s),
-            _ => seeds.clone(),
-        }
+/// The image, halved to the tracking resolution.
+fn reduced<const C: usize>(mut image: Planes<C>, settings: &TrackingSettings) -> Planes<C> {
+    while image.width.max(image.height) > settings.max_side.max(2) as usize {
+        image = image.halved();
     }
+    image
 }
 
 /// What is known beforehand of the flow from the first frame to the second, and back.
@@ -163,67 +172,79 @@ pub(super) fn match_frames(
     guides: Option<Guides<'_>>,
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
-    match_frames_with(Instructions::detect(), first, second, guides, settings)
+    match_pyramids(Instructions::detect(), &first.pyramid, &second.pyramid, guides, settings)
 }
 
-pub(super) fn match_frames_with(
+/// [`match_frames`] of frames that are only matched, with certain instructions.
+pub(super) fn match_pyramids(
     instructions: Instructions,
-    first: &Frame,
-    second: &Frame,
+    first: &Pyramid,
+    second: &Pyramid,
     guides: Option<Guides<'_>>,
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
-    let coarsest = first.levels.len() - 1;
-    let radius =
-        (settings.search_radius.clamp(0.0, 1.0) * first.levels[coarsest].width as f32).round() as usize;
-    let seeds = coarse::search(instructions, &first.levels[coarsest], &second.levels[coarsest], radius);
+    match (first, second) {
+        (Pyramid::Luma(a), Pyramid::Luma(b)) => match_levels(instructions, a, b, guides, settings),
+        (Pyramid::Colour(a), Pyramid::Colour(b)) => match_levels(instructions, a, b, guides, settings),
+        // Frames of one view have one setting.
+        _ => {
+            let [width, height] = first.size();
+            (Flow::zeros(width, height), Flow::zeros(width, height))
+        }
+    }
+}
+
+fn match_levels<const C: usize>(
+    instructions: Instructions,
+    first: &[Level<C>],
+    second: &[Level<C>],
+    guides: Option<Guides<'_>>,
+    settings: &TrackingSettings,
+) -> (Flow, Flow) {
+    let (a, b) = (&first[first.len() - 1].planes, &second[second.len() - 1].planes);
+    let radius = (settings.search_radius.clamp(0.0, 1.0) * a.width as f32).round() as usize;
+    let seeds = coarse::search(instructions, a, b, radius);
+    let (forward, backward) = (guides.map(|guides| guides.forward()), guides.map(|guides| guides.backward()));
     rayon::join(
-        || {
-            first.descend(
-                second,
-                instructions,
-                &seeds.forward,
-                guides.map(|guides| guides.forward()),
-                settings,
-            )
-        },
-        || {
-            second.descend(
-                first,
-                instructions,
-                &seeds.backward,
-                guides.map(|guides| guides.backward()),
-                settings,
-            )
-        },
+        || descend_pyramid(instructions, first, second, &seeds.forward, forward, settings),
+        || descend_pyramid(instructions, second, first, &seeds.backward, backward, settings),
     )
 }
 
-fn descend_pyramid<const P: usize, const C: usize>(
+fn descend_pyramid<const C: usize>(
     instructions: Instructions,
-    from: &[Level<P, C>],
-    to: &[Level<P, C>],
+    from: &[Level<C>],
+    to: &[Level<C>],
     seeds: &Flow,
     guide: Option<Guess<'_>>,
     settings: &TrackingSettings,
 ) -> Flow {
     let coarsest = from.len() - 1;
     let smoothing = Smoothing::of(settings);
+    let k = settings.k;
     let mut flow: Option<Flow> = None;
     for level in (0..=coarsest).rev() {
         let (reference, target) = (&from[level], &to[level]);
-        let mut guesses = vec![Guess { flow: seeds, scale: (1u32 << (coarsest - level)) as f32 }];
+        let planes = &reference.planes;
+        if level < (k[3] as usize).min(coarsest) {
+            let coarser = flow.unwrap_or_else(|| seeds.clone());
+            let start = coarser.doubled(planes.width, planes.height, k[5] > 0.0);
+            flow = Some(refine(instructions, reference, target, start, None, smoothing));
+            continue;
+        }
+        let mut guesses = Vec::new();
         guesses.extend(flow.as_ref().map(|flow| Guess { flow, scale: 2.0 }));
         let scale = 1.0 / (1u32 << level) as f32;
         guesses.extend(guide.map(|guide| Guess { scale: guide.scale * scale, ..guide }));
+        let seeds = (level == coarsest).then_some(Guess { flow: seeds, scale: 1.0 });
         let stride = if level == 0 { settings.patch_stride } else { settings.patch_stride.div_ceil(2) };
-        let planes = &reference.planes;
         let mut field = PatchField::new(planes.width, planes.height, stride as usize);
         patches::search(
             instructions,
             planes,
             &target.planes,
             &guesses,
+            seeds,
             settings.patch_iterations,
             &mut field,
         );

@@ -3,7 +3,7 @@
 use super::{
     TrackingSettings,
     flow::Flow,
-    pair::{Frame, Guides, match_frames_with},
+    pair::{Guides, Pyramid, match_pyramids},
 };
 use crate::{image::Image, simd::Instructions};
 
@@ -71,11 +71,11 @@ pub fn pair_flow(
         return Ok(PairFlow { forward: nothing.clone(), backward: nothing });
     }
     let instructions = Instructions::detect();
-    let (first, second) = rayon::join(|| Frame::new(first, settings), || Frame::new(second, settings));
+    let (first, second) = rayon::join(|| Pyramid::new(first, settings), || Pyramid::new(second, settings));
     let initial = initial.map(|initial| (initial.forward.planar(), initial.backward.planar()));
-    let scale = Flow::reduction(size.0 as usize, size.1 as usize, first.width(), first.height());
+    let scale = Flow::reduction([size.0 as usize, size.1 as usize], first.size());
     let guides = initial.as_ref().map(|(forward, backward)| Guides { forward, backward, scale: 1.0 / scale });
-    let (forward, backward) = match_frames_with(instructions, &first, &second, guides, settings);
+    let (forward, backward) = match_pyramids(instructions, &first, &second, guides, settings);
     let [forward, backward] = [forward, backward].map(|flow| enlarged(&flow, size, scale));
     Ok(PairFlow { forward, backward })
 }

@@ -24,6 +24,10 @@ const MEAN_WEIGHT: f32 = 0.1;
 const SAME_CANDIDATE: f32 = 0.1;
 /// Steps shorter than this end a descent, pixels.
 const SETTLED: f32 = 0.01;
+/// A match found without regard to its neighbours must be better than the others by a factor and by what noise of
+/// some grey levels makes of a difference: patches without texture match anywhere.
+const LEAST_GAIN: f32 = 0.7;
+const LEAST_DIFFERENCE: f32 = 4.0 * PATCH_PIXELS as f32;
 /// Most candidates of a patch.
 const CANDIDATES: usize = 8;
 
@@ -125,7 +129,7 @@ impl<S: Simd> Window<S> {
 
 /// A patch's row and the pixels that interpolation needs beyond it.
 #[inline(always)]
-fn line<const LENGTH: usize>(channel: &[f32], first: usize) -> &[f32; LENGTH] {
+pub(super) fn line<const LENGTH: usize>(channel: &[f32], first: usize) -> &[f32; LENGTH] {
     let (line, _) = channel[first..].split_first_chunk().unwrap_or_else(|| beyond_the_border());
     line
 }
@@ -267,9 +271,12 @@ impl<S: Simd, const C: usize> Template<S, C> {
         let mut start = candidates.list[0];
         let mut best = self.compare(target, x + start[0], y + start[1]);
         let mut is_first = true;
-        for &candidate in &candidates.list[1..candidates.count] {
+        for n in 1..candidates.count {
+            let candidate = candidates.list[n];
             let comparison = self.compare(target, x + candidate[0], y + candidate[1]);
-            if comparison.cost < best.cost {
+            let bound =
+                if n < candidates.trusted { best.cost } else { LEAST_GAIN * best.cost - LEAST_DIFFERENCE };
+            if comparison.cost < bound {
                 (start, best, is_first) = (candidate, comparison, false);
             }
         }
@@ -312,22 +319,17 @@ impl<S: Simd, const C: usize> Template<S, C> {
 }
 
 /// Displacements to try, without repetitions.
+#[derive(Default)]
 struct Candidates {
+    trusted: usize,
     list: [[f32; 2]; CANDIDATES],
     count: usize,
 }
 
 impl Candidates {
     #[inline(always)]
-    fn starting_with(first: [f32; 2]) -> Self {
-        let mut list = [[0.0; 2]; CANDIDATES];
-        list[0] = first;
-        Self { list, count: 1 }
-    }
-
-    #[inline(always)]
     fn offer(&mut self, candidate: [f32; 2]) {
-        if self.count == CANDIDATES {
+        if self.count == CANDIDATES || !(candidate[0] + candidate[1]).is_finite() {
             return;
         }
         for seen in &self.list[..self.count] {
@@ -346,7 +348,8 @@ simd_kernel! {
     /// Candidates of a patch are the fields of `guesses` at its centre, zero, and what its neighbours found: those
     /// left and above in the first pass, those right and below in the second.
     pub(super) fn search<const C: usize>(
-        reference: &Planes<C>, target: &Planes<C>, guesses: &[Guess<'_>], iterations: u32, field: &mut PatchField,
+        reference: &Planes<C>, target: &Planes<C>, guesses: &[Guess<'_>],
+        seeds: Option<Guess<'_>>, iterations: u32, field: &mut PatchField,
     ) = search_kernel
 }
 
@@ -355,6 +358,7 @@ fn search_kernel<S: Simd, const C: usize>(
     reference: &Planes<C>,
     target: &Planes<C>,
     guesses: &[Guess<'_>],
+    seeds: Option<Guess<'_>>,
     iterations: u32,
     field: &mut PatchField,
 ) {
@@ -367,15 +371,20 @@ fn search_kernel<S: Simd, const C: usize>(
                 (x + PATCH / 2).min(reference.width - 1) as f32 + 0.5,
                 (y + PATCH / 2).min(reference.height - 1) as f32 + 0.5,
             ];
-            let mut candidates = Candidates::starting_with([0.0; 2]);
+            let mut candidates = Candidates::default();
             for guess in guesses {
                 candidates.offer(guess.at(centre[0], centre[1]));
             }
+            candidates.offer([0.0; 2]);
             let neighbours = [(i > 0, 1), (j > 0, columns), (i > 0 && j > 0, columns + 1)];
             for (exists, back) in neighbours {
                 if exists {
                     candidates.offer(field.displacement[at - back]);
                 }
+            }
+            candidates.trusted = candidates.count;
+            if let Some(seeds) = seeds {
+                candidates.offer(seeds.at(centre[0], centre[1]));
             }
             let template = Template::<S, C>::new(reference, x, y);
             let corner = [x as f32, y as f32];
@@ -386,7 +395,8 @@ fn search_kernel<S: Simd, const C: usize>(
     for j in (0..rows).rev() {
         for i in (0..columns).rev() {
             let at = j * columns + i;
-            let mut candidates = Candidates::starting_with(field.displacement[at]);
+            let mut candidates = Candidates::default();
+            candidates.offer(field.displacement[at]);
             let (right, below) = (i + 1 < columns, j + 1 < rows);
             let neighbours = [(right, 1), (below, columns), (right && below, columns + 1)];
             for (exists, ahead) in neighbours {
@@ -397,6 +407,7 @@ fn search_kernel<S: Simd, const C: usize>(
             if candidates.count == 1 {
                 continue;
             }
+            candidates.trusted = candidates.count;
             let template = Template::<S, C>::new(reference, field.xs[i], field.ys[j]);
             let corner = [field.xs[i] as f32, field.ys[j] as f32];
             (field.displacement[at], field.cost[at]) =

@@ -23,34 +23,73 @@ pub(super) struct Planes<const CHANNELS: usize = 3> {
 impl Planes {
     /// Planes of an image; values that are not finite become 0.
     pub(super) fn from_image(image: &Image) -> Self {
-        let (width, height) = (image.width as usize, image.height as usize);
-        let mut interiors = [(); 3].map(|()| Vec::with_capacity(width * height));
-        for pixel in image.pixels.as_chunks::<3>().0 {
-            for (interior, &value) in interiors.iter_mut().zip(pixel) {
-                let value = if value.is_finite() { value } else { 0.0 };
-                interior.push(255.0 * value.clamp(-4.0, 4.0));
+        let width = image.width as usize;
+        Self::from_rows(width, image.height as usize, |channel, y, row| {
+            let pixels = image.pixels[3 * y * width..3 * (y + 1) * width].as_chunks::<3>().0;
+            for (value, pixel) in row.iter_mut().zip(pixels) {
+                *value = grey_levels(pixel[channel]);
             }
-        }
-        Self::from_interiors(width, height, interiors)
+        })
     }
+}
 
-    pub(super) fn luma(&self) -> Planes<1> {
-        let [r, g, b] = &self.channels;
-        let mix = |((r, g), b): ((&f32, &f32), &f32)| LUMA[0] * r + LUMA[1] * g + LUMA[2] * b;
-        let luma = r.iter().zip(g).zip(b).map(mix).collect();
-        Planes { width: self.width, height: self.height, stride: self.stride, channels: [luma] }
+impl Planes<1> {
+    /// The luma of an image; values that are not finite count as 0.
+    pub(super) fn luma_of(image: &Image) -> Self {
+        let width = image.width as usize;
+        Self::from_rows(width, image.height as usize, |_, y, row| {
+            let pixels = image.pixels[3 * y * width..3 * (y + 1) * width].as_chunks::<3>().0;
+            for (value, [r, g, b]) in row.iter_mut().zip(pixels) {
+                *value = LUMA[0] * grey_levels(*r) + LUMA[1] * grey_levels(*g) + LUMA[2] * grey_levels(*b);
+            }
+        })
     }
+}
+
+fn grey_levels(value: f32) -> f32 {
+    let value = if value.is_finite() { value } else { 0.0 };
+    255.0 * value.clamp(-4.0, 4.0)
 }
 
 impl<const CHANNELS: usize> Planes<CHANNELS> {
     /// Adds the border to channels of `height * width` values.
     pub(super) fn from_interiors(width: usize, height: usize, interiors: [Vec<f32>; CHANNELS]) -> Self {
+        Self::from_rows(width, height, |channel, y, row| {
+            row.copy_from_slice(&interiors[channel][y * width..(y + 1) * width]);
+        })
+    }
+
+    /// Planes whose rows `fill(channel, row, values)` writes; all values start as 0.
+    pub(super) fn from_rows(
+        width: usize,
+        height: usize,
+        mut fill: impl FnMut(usize, usize, &mut [f32]),
+    ) -> Self {
         let stride = width + 2 * BORDER;
-        let channels = interiors.map(|interior| with_border(&interior, width, height));
+        let mut channel = 0;
+        let channels = [(); CHANNELS].map(|()| {
+            let mut values = vec![0.0f32; stride * (height + 2 * BORDER)];
+            for (y, line) in values.chunks_exact_mut(stride).skip(BORDER).take(height).enumerate() {
+                fill(channel, y, &mut line[BORDER..BORDER + width]);
+                let (left, right) = (line[BORDER], line[BORDER + width - 1]);
+                line[..BORDER].fill(left);
+                line[BORDER + width..].fill(right);
+            }
+            let (top, bottom) = (BORDER * stride, (BORDER + height - 1) * stride);
+            for y in 0..BORDER {
+                values.copy_within(top..top + stride, y * stride);
+                values.copy_within(bottom..bottom + stride, (BORDER + height + y) * stride);
+            }
+            channel += 1;
+            values
+        });
         Self { width, height, stride, channels }
     }
 
-    pub(super) const CHANNELS: usize = CHANNELS;
+    /// Columns and rows.
+    pub(super) fn size(&self) -> [usize; 2] {
+        [self.width, self.height]
+    }
 
     /// Index of a pixel in a channel.
     #[inline(always)]
@@ -72,34 +111,28 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
     /// Half the size, each pixel the mean of four; an odd last row or column is replicated.
     pub(super) fn halved(&self) -> Self {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        let halve = |channel: &Vec<f32>| {
-            let mut half = Vec::with_capacity(width * height);
-            for y in 0..height {
-                let first = (2 * y + BORDER) * self.stride + BORDER;
-                let upper = &channel[first..first + 2 * width];
-                let lower = &channel[first + self.stride..first + self.stride + 2 * width];
-                let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
-                half.extend(pairs.map(|(a, b)| 0.25 * (a[0] + a[1] + b[0] + b[1])));
+        Self::from_rows(width, height, |channel, y, row| {
+            let (first, channel) = (self.index(0, 2 * y), &self.channels[channel]);
+            let upper = &channel[first..first + 2 * width];
+            let lower = &channel[first + self.stride..first + self.stride + 2 * width];
+            let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
+            for (value, (a, b)) in row.iter_mut().zip(pairs) {
+                *value = 0.25 * (a[0] + a[1] + b[0] + b[1]);
             }
-            half
-        };
-        Self::from_interiors(width, height, self.channels.each_ref().map(halve))
+        })
     }
 
     /// Central differences along x and along y.
     pub(super) fn gradients(&self) -> [Self; 2] {
         [1, self.stride].map(|step| {
-            let interiors = self.channels.each_ref().map(|values| {
-                let mut differences = Vec::with_capacity(self.width * self.height);
-                for y in 0..self.height {
-                    let first = (y + BORDER) * self.stride + BORDER;
-                    let ahead = &values[first + step..first + step + self.width];
-                    let behind = &values[first - step..first - step + self.width];
-                    differences.extend(ahead.iter().zip(behind).map(|(a, b)| 0.5 * (a - b)));
+            Self::from_rows(self.width, self.height, |channel, y, row| {
+                let (first, values) = (self.index(0, y), &self.channels[channel]);
+                let ahead = &values[first + step..first + step + self.width];
+                let behind = &values[first - step..first - step + self.width];
+                for ((value, a), b) in row.iter_mut().zip(ahead).zip(behind) {
+                    *value = 0.5 * (a - b);
                 }
-                differences
-            });
-            Self::from_interiors(self.width, self.height, interiors)
+            })
         })
     }
 
@@ -145,18 +178,6 @@ pub(super) fn pyramid<const CHANNELS: usize>(
         let next = coarsest.halved();
         levels.push(next);
     }
-}
-
-fn with_border(interior: &[f32], width: usize, height: usize) -> Vec<f32> {
-    let mut padded = Vec::with_capacity((width + 2 * BORDER) * (height + 2 * BORDER));
-    for y in 0..height + 2 * BORDER {
-        let source = y.saturating_sub(BORDER).min(height - 1);
-        let row = &interior[source * width..(source + 1) * width];
-        padded.extend(std::iter::repeat_n(row[0], BORDER));
-        padded.extend_from_slice(row);
-        padded.extend(std::iter::repeat_n(row[width - 1], BORDER));
-    }
-    padded
 }
 
 #[cfg(test)]

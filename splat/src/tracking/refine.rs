@@ -10,6 +10,8 @@ const RESIDUAL_SCALE: f32 = 4.0;
 const DIFFERENCE_SCALE: f32 = 0.3;
 /// Weight of staying: keeps pixels without neighbour or texture where they are.
 const HOLD: f32 = 1e-4;
+/// Spectral radius of the sweeps that their acceleration expects.
+const SPECTRAL_RADIUS: f32 = 0.98;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
 const SHADING_RADIUS: usize = 4;
 
@@ -24,6 +26,9 @@ pub(super) struct Smoothing {
     pub(super) window: u32,
     /// Sweeps over the image per linearisation.
     pub(super) iterations: u32,
+    pub(super) radius: f32,
+    pub(super) shading: f32,
+    pub(super) consistent: bool,
 }
 
 impl Smoothing {
@@ -33,15 +38,18 @@ impl Smoothing {
             warps: settings.smoothing_warps,
             window: settings.smoothing_window,
             iterations: settings.smoothing_iterations,
+            radius: settings.k[4],
+            shading: settings.k[8],
+            consistent: settings.k[9] > 0.0,
         }
     }
 }
 
 /// Refines `flow` from `reference` to `target`; where `trust` is given and false, colour does not count.
-pub(super) fn refine<const P: usize, const C: usize>(
+pub(super) fn refine<const C: usize>(
     instructions: Instructions,
-    reference: &Level<P, C>,
-    target: &Level<P, C>,
+    reference: &Level<C>,
+    target: &Level<C>,
     mut flow: Flow,
     trust: Option<&[bool]>,
     smoothing: Smoothing,
@@ -50,13 +58,13 @@ pub(super) fn refine<const P: usize, const C: usize>(
         return flow;
     }
     for _ in 0..smoothing.warps {
-        let linear = Linearised::new(instructions, reference, target, &flow);
+        let linear = Linearised::new(instructions, reference, target, &flow, smoothing);
         let mut equations = Equations::zeros(flow.width, flow.height);
         combine(instructions, &linear, trust, &mut equations);
+        let mut mean = vec![0.0; flow.u.len()];
         for term in
             [&mut equations.xx, &mut equations.xy, &mut equations.yy, &mut equations.x, &mut equations.y]
         {
-            let mut mean = vec![0.0; term.len()];
             average_windows(
                 instructions,
                 term,
@@ -65,10 +73,10 @@ pub(super) fn refine<const P: usize, const C: usize>(
                 smoothing.window as usize,
                 &mut mean,
             );
-            *term = mean;
+            std::mem::swap(term, &mut mean);
         }
         link(instructions, &reference.similarity, &flow, smoothing.weight, &mut equations);
-        relax(instructions, &equations, smoothing.iterations, &mut flow);
+        relax(instructions, &equations, smoothing.iterations, smoothing.radius, &mut flow);
     }
     flow
 }
@@ -81,11 +89,12 @@ struct Linearised<const C: usize> {
 }
 
 impl<const C: usize> Linearised<C> {
-    fn new<const P: usize>(
+    fn new(
         instructions: Instructions,
-        reference: &Level<P, C>,
-        target: &Level<P, C>,
+        reference: &Level<C>,
+        target: &Level<C>,
         flow: &Flow,
+        smoothing: Smoothing,
     ) -> Self {
         let pixels = flow.u.len();
         let zeros = || [(); C].map(|()| vec![0.0f32; pixels]);
@@ -94,20 +103,28 @@ impl<const C: usize> Linearised<C> {
         let mut mean = vec![0.0; pixels];
         for residual in &mut linear.residual {
             average_windows(instructions, residual, flow.width, flow.height, SHADING_RADIUS, &mut mean);
-            residual.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= mean);
+            residual.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= smoothing.shading * mean);
+        }
+        if smoothing.consistent {
+            for axis in [&mut linear.along_x, &mut linear.along_y] {
+                for values in axis {
+                    average_windows(instructions, values, flow.width, flow.height, SHADING_RADIUS, &mut mean);
+                    values.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= smoothing.shading * mean);
+                }
+            }
         }
         linear
     }
 }
 
 simd_kernel! {
-    fn warp<const P: usize, const C: usize>(reference: &Level<P, C>, target: &Level<P, C>, flow: &Flow, linear: &mut Linearised<C>) = warp_kernel
+    fn warp<const C: usize>(reference: &Level<C>, target: &Level<C>, flow: &Flow, linear: &mut Linearised<C>) = warp_kernel
 }
 
 #[inline(always)]
-fn warp_kernel<S: Simd, const P: usize, const C: usize>(
-    reference: &Level<P, C>,
-    target: &Level<P, C>,
+fn warp_kernel<S: Simd, const C: usize>(
+    reference: &Level<C>,
+    target: &Level<C>,
     flow: &Flow,
     linear: &mut Linearised<C>,
 ) {
@@ -117,7 +134,7 @@ fn warp_kernel<S: Simd, const P: usize, const C: usize>(
             // The target's gradients: those of the reference are turned and sheared against it.
             let sample = target.texels.sample(x as f32 + flow.u[i], y as f32 + flow.v[i]);
             for (c, [value, along_x, along_y, _]) in sample.into_iter().enumerate() {
-                linear.residual[c][i] = value - reference.shown.channels[c][reference.shown.index(x, y)];
+                linear.residual[c][i] = value - reference.planes.channels[c][reference.planes.index(x, y)];
                 linear.along_x[c][i] = along_x;
                 linear.along_y[c][i] = along_y;
             }
@@ -246,21 +263,25 @@ fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, eq
 }
 
 simd_kernel! {
-    /// Jacobi sweeps: each pixel solves its equations with its neighbours held.
-    fn relax(equations: &Equations, sweeps: u32, flow: &mut Flow) = relax_kernel
+    /// Jacobi sweeps, each pixel solving its equations with its neighbours held, with Chebyshev's acceleration (Golub
+    /// and Varga, 1961).
+    fn relax(equations: &Equations, sweeps: u32, radius: f32, flow: &mut Flow) = relax_kernel
 }
 
 #[inline(always)]
-fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, flow: &mut Flow) {
+fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, radius: f32, flow: &mut Flow) {
     let (width, height) = (flow.width, flow.height);
     // A row before and after, so that every neighbour exists; its links are 0.
     let spare = vec![0.0; width];
     let mut current = [[&spare[..], &flow.u, &spare].concat(), [&spare[..], &flow.v, &spare].concat()];
     let mut next = current.clone();
-    for _ in 0..sweeps {
+    let mut momentum = 1.0;
+    for sweep in 0..sweeps {
         for y in 0..height {
-            sweep_row(equations, y, &current, &mut next);
+            sweep_row(equations, y, momentum, &current, &mut next);
         }
+        let square = radius * radius;
+        momentum = 1.0 / (1.0 - if sweep == 0 { 0.5 * square } else { 0.25 * square * momentum });
         std::mem::swap(&mut current, &mut next);
     }
     flow.u.copy_from_slice(&current[0][width..width * (height + 1)]);
@@ -268,7 +289,13 @@ fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, flow: &mut Flow) {
 }
 
 #[inline(always)]
-fn sweep_row(equations: &Equations, y: usize, current: &[Vec<f32>; 2], next: &mut [Vec<f32>; 2]) {
+fn sweep_row(
+    equations: &Equations,
+    y: usize,
+    momentum: f32,
+    current: &[Vec<f32>; 2],
+    next: &mut [Vec<f32>; 2],
+) {
     let width = equations.width;
     let (first, centre) = (y * width, (y + 1) * width);
     let line = first..first + width;
@@ -290,8 +317,10 @@ fn sweep_row(equations: &Equations, y: usize, current: &[Vec<f32>; 2], next: &mu
             left[i] * u_left[i] + up[i] * u_up[i] + right[i] * u_right[i] + down[i] * u_down[i] + x[i];
         let pull_v =
             left[i] * v_left[i] + up[i] * v_up[i] + right[i] * v_right[i] + down[i] * v_down[i] + y[i];
-        next_u[i] = xx[i] * pull_u + xy[i] * pull_v;
-        next_v[i] = xy[i] * pull_u + yy[i] * pull_v;
+        let (solved_u, solved_v) = (xx[i] * pull_u + xy[i] * pull_v, xy[i] * pull_u + yy[i] * pull_v);
+        // `next` holds the values before the current ones.
+        next_u[i] += momentum * (solved_u - next_u[i]);
+        next_v[i] += momentum * (solved_v - next_v[i]);
     }
 }
 

@@ -16,8 +16,10 @@ pub struct TrackingSettings {
     /// Largest displacement between two frames that the exhaustive search finds, as a fraction of the width; 0 to 1,
     /// default 0.4.
     pub search_radius: f32,
+    /// Whether colour is matched instead of brightness alone: surer, and slower; default true.
+    pub colour: bool,
     /// TEMP
-    pub colour: u32,
+    pub k: [f32; 10],
     /// Distances in frames over which tracks are chained besides the direct match with the key frame; each at least
     /// 1, default 1 and 2.
     pub gaps: Vec<u32>,
@@ -56,7 +58,8 @@ impl TrackingSettings {
             max_side: 800,
             search_side: 100,
             search_radius: 0.4,
-            colour: 3,
+            colour: true,
+            k: [1.0, 0.0, 0.0, 0.0, 0.98, 0.0, 0.0, 0.0, 1.0, 0.0],
             gaps: vec![1, 2],
             patch_stride: 3,
             patch_iterations: 12,

@@ -149,7 +149,7 @@ impl<'a> Tracker<'a> {
     fn field(&self, tracks: &Judged) -> TrackField {
         let (width, height) = (self.width as usize, self.height as usize);
         let flow = &tracks.flow;
-        let scale = Flow::reduction(width, height, flow.width, flow.height);
+        let scale = Flow::reduction([width, height], [flow.width, flow.height]);
         let mut field = TrackField {
             width: self.width,
             height: self.height,
