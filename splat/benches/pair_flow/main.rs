@@ -29,6 +29,9 @@ struct Arguments {
     /// Cameras of the clips.
     #[arg(long, value_name = "NAME", default_values = ["cam00", "cam03", "cam06"], num_args = 1..)]
     cameras: Vec<String>,
+    /// Enlarge the clips' frames by this factor before errors are measured; errors stay in pixels of the clips.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1)]
+    enlarge: u32,
     /// Presets.
     #[arg(long, value_name = "NAME", default_values = ["draft", "balanced", "best"], num_args = 1..)]
     quality: Vec<String>,
@@ -68,7 +71,15 @@ fn main() -> Result<()> {
     let mut presets = Vec::new();
     for name in &arguments.quality {
         let settings = settings(name, &arguments.set)?;
-        presets.push(measure::preset(name, &settings, &frames, &SIZES, arguments.repeats, &clips)?);
+        presets.push(measure::preset(
+            name,
+            &settings,
+            &frames,
+            &SIZES,
+            arguments.repeats,
+            &clips,
+            arguments.enlarge,
+        )?);
     }
     let report = Report { machine, presets };
     if arguments.json {

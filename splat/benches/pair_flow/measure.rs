@@ -4,7 +4,7 @@ use anyhow::Result;
 use serde::Serialize;
 use splat::{
     image::Image,
-    tracking::{TrackingSettings, pair_flow},
+    tracking::{DenseFlow, TrackingSettings, pair_flow},
 };
 
 use super::{
@@ -47,7 +47,7 @@ impl Frames {
 }
 
 /// Bilinear, corners replicated.
-fn resized(image: &Image, (width, height): (u32, u32)) -> Image {
+pub(crate) fn resized(image: &Image, (width, height): (u32, u32)) -> Image {
     let mut out = Image::filled(width, height, [0.0; 3]);
     let along = |at: usize, to: u32, from: u32| {
         let at = ((at as f32 + 0.5) * from as f32 / to as f32 - 0.5).clamp(0.0, (from - 1) as f32);
@@ -114,6 +114,7 @@ pub(crate) fn preset(
     sizes: &[(u32, u32)],
     repeats: usize,
     clips: &[Clip],
+    enlarge: u32,
 ) -> Result<Preset> {
     let mut times = Vec::new();
     for &(width, height) in sizes {
@@ -128,17 +129,21 @@ pub(crate) fn preset(
             times.push(Time { width, height, milliseconds: 500.0 * fastest });
         }
     }
-    let errors = clips.iter().map(|clip| errors(clip, settings)).collect::<Result<_>>()?;
+    let errors = clips.iter().map(|clip| errors(clip, settings, enlarge)).collect::<Result<_>>()?;
     Ok(Preset { name: name.to_owned(), times, errors })
 }
 
-fn errors(clip: &Clip, settings: &TrackingSettings) -> Result<Errors> {
+fn errors(clip: &Clip, settings: &TrackingSettings, enlarge: u32) -> Result<Errors> {
     let (mut all, mut moving) = (Vec::new(), Vec::new());
     for view in &clip.views {
+        let (width, height) = (view.frames[0].width, view.frames[0].height);
+        let enlarged = |frame: usize| resized(&view.frames[frame], (enlarge * width, enlarge * height));
+        let key = enlarged(0);
         for frame in 1..view.frames.len() {
-            let flow = pair_flow(&view.frames[0], &view.frames[frame], None, settings)?.forward;
-            for (pixel, found) in flow.displacement.iter().enumerate() {
+            let flow = pair_flow(&key, &enlarged(frame), None, settings)?.forward;
+            for pixel in 0..(width * height) as usize {
                 let Some(exact) = view.truth(frame, pixel) else { continue };
+                let found = at_pixel(&flow, pixel, enlarge as usize);
                 let error = (found[0] - exact[0]).hypot(found[1] - exact[1]);
                 all.push(error);
                 if view.moves(pixel) {
@@ -148,4 +153,18 @@ fn errors(clip: &Clip, settings: &TrackingSettings) -> Result<Errors> {
         }
     }
     Ok(Errors { clip: clip.name.clone(), all: Summary::of(all), moving: Summary::of(moving) })
+}
+
+/// The displacement of a pixel of the clip in a flow of frames enlarged by a factor: the mean over what it became.
+fn at_pixel(flow: &DenseFlow, pixel: usize, factor: usize) -> [f32; 2] {
+    let width = flow.width as usize;
+    let (x, y) = (pixel % (width / factor) * factor, pixel / (width / factor) * factor);
+    let mut sum = [0.0; 2];
+    for row in y..y + factor {
+        for [u, v] in &flow.displacement[row * width + x..row * width + x + factor] {
+            sum = [sum[0] + u, sum[1] + v];
+        }
+    }
+    // A factor for the mean along each axis, and one for the unit.
+    sum.map(|value| value / (factor * factor * factor) as f32)
 }

@@ -41,15 +41,12 @@ impl Flow {
     }
 
     /// The same field on a grid of twice the resolution, displacements scaled along.
-    pub(super) fn doubled(&self, width: usize, height: usize, bilinear: bool) -> Self {
+    /// The nearest value, so that motion boundaries stay sharp.
+    pub(super) fn doubled(&self, width: usize, height: usize) -> Self {
         let mut out = Self::zeros(width, height);
         for y in 0..height {
             for x in 0..width {
-                let [u, v] = if bilinear {
-                    self.sample((x as f32 + 0.5) * 0.5 - 0.5, (y as f32 + 0.5) * 0.5 - 0.5)
-                } else {
-                    self.at(x / 2, y / 2)
-                };
+                let [u, v] = self.at(x / 2, y / 2);
                 out.u[y * width + x] = 2.0 * u;
                 out.v[y * width + x] = 2.0 * v;
             }

@@ -1,7 +1,8 @@
 //! Dense flow between two frames of a view, both ways.
 
 use super::{
-    TrackingSettings, coarse,
+    TrackingSettings,
+    coarse::{self, CoarseMatches},
     densify::densify,
     flow::Flow,
     patches::{self, Guess, PatchField},
@@ -23,8 +24,7 @@ pub(super) struct Level<const C: usize> {
 }
 
 impl<const C: usize> Level<C> {
-    fn pyramid(image: Planes<C>, settings: &TrackingSettings) -> Vec<Self> {
-        let finest = reduced(image, settings);
+    pub(super) fn pyramid(finest: Planes<C>, settings: &TrackingSettings) -> Vec<Self> {
         let level = |planes: Planes<C>| {
             let texels = Texels::new(&planes);
             let similarity = similarity(&planes);
@@ -62,8 +62,15 @@ fn similarity<const C: usize>(planes: &Planes<C>) -> [Vec<f32>; 2] {
     similarity
 }
 
-/// What of a frame is matched: a pyramid, finest level first.
-pub(super) enum Pyramid {
+/// What of a frame is matched.
+pub(super) struct Pyramid {
+    levels: Levels,
+    /// The image of the exhaustive search, in colour.
+    searched: Planes,
+}
+
+/// Finest level first.
+pub(super) enum Levels {
     Luma(Vec<Level<1>>),
     Colour(Vec<Level<3>>),
 }
@@ -71,20 +78,32 @@ pub(super) enum Pyramid {
 impl Pyramid {
     /// The pyramid of an image that has pixels.
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        if settings.colour {
-            Self::Colour(Level::pyramid(Planes::from_image(image), settings))
+        let halvings = halvings(image, settings.max_side);
+        let levels = if settings.colour {
+            Levels::Colour(Level::pyramid(Planes::from_image(image, halvings), settings))
         } else {
-            Self::Luma(Level::pyramid(Planes::luma_of(image), settings))
-        }
+            Levels::Luma(Level::pyramid(Planes::luma_of(image, halvings), settings))
+        };
+        let searched = match &levels {
+            Levels::Luma(levels) => Planes::from_image(image, halvings + levels.len() as u32 - 1),
+            Levels::Colour(levels) => levels[levels.len() - 1].planes.clone(),
+        };
+        Self { levels, searched }
     }
 
     /// Columns and rows of the finest level.
     pub(super) fn size(&self) -> [usize; 2] {
-        match self {
-            Self::Luma(levels) => levels[0].planes.size(),
-            Self::Colour(levels) => levels[0].planes.size(),
+        match &self.levels {
+            Levels::Luma(levels) => levels[0].planes.size(),
+            Levels::Colour(levels) => levels[0].planes.size(),
         }
     }
+}
+
+/// How often an image is halved until its longer side has at most so many pixels.
+fn halvings(image: &Image, side: u32) -> u32 {
+    let longer = image.width.max(image.height);
+    (0..31).find(|halvings| longer.div_ceil(1 << halvings) <= side.max(2)).unwrap_or(31)
 }
 
 /// A frame, prepared for matching and for comparison.
@@ -99,9 +118,9 @@ pub(super) struct Frame {
 impl Frame {
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
         let pyramid = Pyramid::new(image, settings);
-        let finest = match &pyramid {
-            Pyramid::Colour(levels) => levels[0].planes.clone(),
-            Pyramid::Luma(_) => reduced(Planes::from_image(image), settings),
+        let finest = match &pyramid.levels {
+            Levels::Colour(levels) => levels[0].planes.clone(),
+            Levels::Luma(_) => Planes::from_image(image, halvings(image, settings.max_side)),
         };
         Self { gradients: [finest.gradients()], levels: [finest], pyramid }
     }
@@ -125,25 +144,15 @@ impl Frame {
         settings: &TrackingSettings,
     ) -> Flow {
         let (instructions, trust, smoothing) = (Instructions::detect(), Some(trust), Smoothing::of(settings));
-        match (&self.pyramid, &other.pyramid) {
-            (Pyramid::Luma(a), Pyramid::Luma(b)) => {
-                refine(instructions, &a[0], &b[0], flow, trust, smoothing)
-            }
-            (Pyramid::Colour(a), Pyramid::Colour(b)) => {
+        match (&self.pyramid.levels, &other.pyramid.levels) {
+            (Levels::Luma(a), Levels::Luma(b)) => refine(instructions, &a[0], &b[0], flow, trust, smoothing),
+            (Levels::Colour(a), Levels::Colour(b)) => {
                 refine(instructions, &a[0], &b[0], flow, trust, smoothing)
             }
             // Frames of one view have one setting.
             _ => flow,
         }
     }
-}
-
-/// The image, halved to the tracking resolution.
-fn reduced<const C: usize>(mut image: Planes<C>, settings: &TrackingSettings) -> Planes<C> {
-    while image.width.max(image.height) > settings.max_side.max(2) as usize {
-        image = image.halved();
-    }
-    image
 }
 
 /// What is known beforehand of the flow from the first frame to the second, and back.
@@ -183,9 +192,11 @@ pub(super) fn match_pyramids(
     guides: Option<Guides<'_>>,
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
-    match (first, second) {
-        (Pyramid::Luma(a), Pyramid::Luma(b)) => match_levels(instructions, a, b, guides, settings),
-        (Pyramid::Colour(a), Pyramid::Colour(b)) => match_levels(instructions, a, b, guides, settings),
+    let radius = (settings.search_radius.clamp(0.0, 1.0) * first.searched.width as f32).round() as usize;
+    let seeds = coarse::search(instructions, &first.searched, &second.searched, radius);
+    match (&first.levels, &second.levels) {
+        (Levels::Luma(a), Levels::Luma(b)) => match_levels(instructions, a, b, &seeds, guides, settings),
+        (Levels::Colour(a), Levels::Colour(b)) => match_levels(instructions, a, b, &seeds, guides, settings),
         // Frames of one view have one setting.
         _ => {
             let [width, height] = first.size();
@@ -198,12 +209,10 @@ fn match_levels<const C: usize>(
     instructions: Instructions,
     first: &[Level<C>],
     second: &[Level<C>],
+    seeds: &CoarseMatches,
     guides: Option<Guides<'_>>,
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
-    let (a, b) = (&first[first.len() - 1].planes, &second[second.len() - 1].planes);
-    let radius = (settings.search_radius.clamp(0.0, 1.0) * a.width as f32).round() as usize;
-    let seeds = coarse::search(instructions, a, b, radius);
     let (forward, backward) = (guides.map(|guides| guides.forward()), guides.map(|guides| guides.backward()));
     rayon::join(
         || descend_pyramid(instructions, first, second, &seeds.forward, forward, settings),
@@ -221,14 +230,13 @@ fn descend_pyramid<const C: usize>(
 ) -> Flow {
     let coarsest = from.len() - 1;
     let smoothing = Smoothing::of(settings);
-    let k = settings.k;
     let mut flow: Option<Flow> = None;
     for level in (0..=coarsest).rev() {
         let (reference, target) = (&from[level], &to[level]);
         let planes = &reference.planes;
-        if level < (k[3] as usize).min(coarsest) {
+        if level < coarsest && planes.width.max(planes.height) > settings.patch_side as usize {
             let coarser = flow.unwrap_or_else(|| seeds.clone());
-            let start = coarser.doubled(planes.width, planes.height, k[5] > 0.0);
+            let start = coarser.doubled(planes.width, planes.height);
             flow = Some(refine(instructions, reference, target, start, None, smoothing));
             continue;
         }

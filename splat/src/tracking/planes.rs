@@ -21,28 +21,16 @@ pub(super) struct Planes<const CHANNELS: usize = 3> {
 }
 
 impl Planes {
-    /// Planes of an image; values that are not finite become 0.
-    pub(super) fn from_image(image: &Image) -> Self {
-        let width = image.width as usize;
-        Self::from_rows(width, image.height as usize, |channel, y, row| {
-            let pixels = image.pixels[3 * y * width..3 * (y + 1) * width].as_chunks::<3>().0;
-            for (value, pixel) in row.iter_mut().zip(pixels) {
-                *value = grey_levels(pixel[channel]);
-            }
-        })
+    /// Planes of an image, halved so many times; values that are not finite become 0.
+    pub(super) fn from_image(image: &Image, halvings: u32) -> Self {
+        Self::block_means(image, halvings, |colour| colour)
     }
 }
 
 impl Planes<1> {
-    /// The luma of an image; values that are not finite count as 0.
-    pub(super) fn luma_of(image: &Image) -> Self {
-        let width = image.width as usize;
-        Self::from_rows(width, image.height as usize, |_, y, row| {
-            let pixels = image.pixels[3 * y * width..3 * (y + 1) * width].as_chunks::<3>().0;
-            for (value, [r, g, b]) in row.iter_mut().zip(pixels) {
-                *value = LUMA[0] * grey_levels(*r) + LUMA[1] * grey_levels(*g) + LUMA[2] * grey_levels(*b);
-            }
-        })
+    /// The luma of an image, halved so many times; values that are not finite count as 0.
+    pub(super) fn luma_of(image: &Image, halvings: u32) -> Self {
+        Self::block_means(image, halvings, |[r, g, b]| [LUMA[0] * r + LUMA[1] * g + LUMA[2] * b])
     }
 }
 
@@ -84,6 +72,39 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
             values
         });
         Self { width, height, stride, channels }
+    }
+
+    /// Means over blocks of `2^halvings` pixels along either axis; blocks that the image does not fill go on with its last
+    /// column and row.
+    fn block_means(image: &Image, halvings: u32, mix: impl Fn([f32; 3]) -> [f32; CHANNELS]) -> Self {
+        let [image_width, image_height] = [image.width as usize, image.height as usize];
+        let side = 1 << halvings;
+        let (width, height) = (image_width.div_ceil(side), image_height.div_ceil(side));
+        let mut line = vec![[0.0f32; 3]; width * side];
+        let mut sums = vec![[0.0f32; CHANNELS]; width * height];
+        for y in 0..height * side {
+            let from = 3 * image_width * y.min(image_height - 1);
+            let values = &image.pixels[from..from + 3 * image_width];
+            let levels = line[..image_width].as_flattened_mut();
+            levels.iter_mut().zip(values).for_each(|(level, &value)| *level = grey_levels(value));
+            let last = line[image_width - 1];
+            line[image_width..].fill(last);
+            let sums = &mut sums[y / side * width..][..width];
+            for (sum, block) in sums.iter_mut().zip(line.chunks_exact(side)) {
+                for &colour in block {
+                    let mixed = mix(colour);
+                    for (sum, value) in sum.iter_mut().zip(mixed) {
+                        *sum += value;
+                    }
+                }
+            }
+        }
+        let share = 1.0 / (side * side) as f32;
+        Self::from_rows(width, height, |channel, y, row| {
+            for (value, sum) in row.iter_mut().zip(&sums[y * width..]) {
+                *value = share * sum[channel];
+            }
+        })
     }
 
     /// Columns and rows.

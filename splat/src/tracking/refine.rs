@@ -27,8 +27,7 @@ pub(super) struct Smoothing {
     /// Sweeps over the image per linearisation.
     pub(super) iterations: u32,
     pub(super) radius: f32,
-    pub(super) shading: f32,
-    pub(super) consistent: bool,
+    pub(super) bend: f32,
 }
 
 impl Smoothing {
@@ -39,8 +38,7 @@ impl Smoothing {
             window: settings.smoothing_window,
             iterations: settings.smoothing_iterations,
             radius: settings.k[4],
-            shading: settings.k[8],
-            consistent: settings.k[9] > 0.0,
+            bend: settings.k[0],
         }
     }
 }
@@ -58,7 +56,7 @@ pub(super) fn refine<const C: usize>(
         return flow;
     }
     for _ in 0..smoothing.warps {
-        let linear = Linearised::new(instructions, reference, target, &flow, smoothing);
+        let linear = Linearised::new(instructions, reference, target, &flow);
         let mut equations = Equations::zeros(flow.width, flow.height);
         combine(instructions, &linear, trust, &mut equations);
         let mut mean = vec![0.0; flow.u.len()];
@@ -75,7 +73,7 @@ pub(super) fn refine<const C: usize>(
             );
             std::mem::swap(term, &mut mean);
         }
-        link(instructions, &reference.similarity, &flow, smoothing.weight, &mut equations);
+        link(instructions, &reference.similarity, &flow, smoothing.weight, smoothing.bend, &mut equations);
         relax(instructions, &equations, smoothing.iterations, smoothing.radius, &mut flow);
     }
     flow
@@ -89,13 +87,7 @@ struct Linearised<const C: usize> {
 }
 
 impl<const C: usize> Linearised<C> {
-    fn new(
-        instructions: Instructions,
-        reference: &Level<C>,
-        target: &Level<C>,
-        flow: &Flow,
-        smoothing: Smoothing,
-    ) -> Self {
+    fn new(instructions: Instructions, reference: &Level<C>, target: &Level<C>, flow: &Flow) -> Self {
         let pixels = flow.u.len();
         let zeros = || [(); C].map(|()| vec![0.0f32; pixels]);
         let mut linear = Self { residual: zeros(), along_x: zeros(), along_y: zeros() };
@@ -103,15 +95,7 @@ impl<const C: usize> Linearised<C> {
         let mut mean = vec![0.0; pixels];
         for residual in &mut linear.residual {
             average_windows(instructions, residual, flow.width, flow.height, SHADING_RADIUS, &mut mean);
-            residual.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= smoothing.shading * mean);
-        }
-        if smoothing.consistent {
-            for axis in [&mut linear.along_x, &mut linear.along_y] {
-                for values in axis {
-                    average_windows(instructions, values, flow.width, flow.height, SHADING_RADIUS, &mut mean);
-                    values.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= smoothing.shading * mean);
-                }
-            }
+            residual.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= mean);
         }
         linear
     }
@@ -222,13 +206,20 @@ fn combine_kernel<S: Simd, const C: usize>(
 simd_kernel! {
     /// Adds the smoothness to the equations and brings them to the form that sweeps use: `x` and `y` the constant
     /// right-hand sides, `xx`, `xy`, `yy` the inverse of the pixel's matrix.
-    fn link(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, equations: &mut Equations) = link_kernel
+    fn link(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, scale: f32, equations: &mut Equations) = link_kernel
 }
 
 #[inline(always)]
-fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, equations: &mut Equations) {
+fn link_kernel<S: Simd>(
+    similarity: &[Vec<f32>; 2],
+    flow: &Flow,
+    weight: f32,
+    scale: f32,
+    equations: &mut Equations,
+) {
     let (width, height) = (flow.width, flow.height);
     let pixels = width * height;
+    let (weight, bend) = (weight * DIFFERENCE_SCALE / scale, 1.0 / (scale * scale));
     for (links, step, similarity) in
         [(&mut equations.left, 1, &similarity[0]), (&mut equations.up, width, &similarity[1])]
     {
@@ -239,8 +230,8 @@ fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, eq
         let (other_u, other_v) = (&flow.u[..count], &flow.v[..count]);
         for i in 0..count {
             let (du, dv) = (u[i] - other_u[i], v[i] - other_v[i]);
-            let bend = (du * du + dv * dv) * (1.0 / (DIFFERENCE_SCALE * DIFFERENCE_SCALE)) + 1.0;
-            links[i] = weight * similarity[i] / bend.sqrt();
+            let stretch = (du * du + dv * dv) * bend + 1.0;
+            links[i] = weight * similarity[i] / stretch.sqrt();
         }
     }
     let equations = &mut *equations;

@@ -23,6 +23,8 @@ pub struct TrackingSettings {
     /// Distances in frames over which tracks are chained besides the direct match with the key frame; each at least
     /// 1, default 1 and 2.
     pub gaps: Vec<u32>,
+    /// Levels whose longer side has more pixels than this are refined without matching patches; default 400.
+    pub patch_side: u32,
     /// Distance of neighbouring patches, pixels; 1 to 8, default 3.
     pub patch_stride: u32,
     /// Descent steps per patch and level; 1 and up, default 12.
@@ -59,8 +61,9 @@ impl TrackingSettings {
             search_side: 100,
             search_radius: 0.4,
             colour: true,
-            k: [1.0, 0.0, 0.0, 0.0, 0.98, 0.0, 0.0, 0.0, 1.0, 0.0],
+            k: [0.3, 0.0, 0.0, 0.0, 0.98, 0.0, 0.0, 0.0, 1.0, 0.0],
             gaps: vec![1, 2],
+            patch_side: 400,
             patch_stride: 3,
             patch_iterations: 12,
             smoothness: 150.0,

@@ -9,6 +9,8 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 use crate::{image::Image, settings::Quality};
 
+mod pair;
+
 /// Smooth colour noise over the plane: band-limited enough that bilinear interpolation errs by a few grey levels.
 #[derive(Clone)]
 struct Texture {
