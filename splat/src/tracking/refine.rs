@@ -6,12 +6,15 @@ use crate::simd::{Instructions, Simd, simd_kernel};
 
 /// Residual at which the data term turns from quadratic to linear, 0 to 255 scale.
 const RESIDUAL_SCALE: f32 = 4.0;
-/// Flow difference between neighbours at which the smoothness turns from quadratic to linear, pixels.
-const DIFFERENCE_SCALE: f32 = 0.3;
+/// Flow difference between neighbours at which the smoothness turns from quadratic to linear, pixels: small where
+/// nothing moves, as what rests does so alike, and growing with the motion, as what moves turns and bends.
+const DIFFERENCE_AT_REST: f32 = 0.03;
+const DIFFERENCE_BY_MOTION: f32 = 0.1;
+const DIFFERENCE_AT_MOST: f32 = 0.3;
 /// Weight of staying: keeps pixels without neighbour or texture where they are.
 const HOLD: f32 = 1e-4;
 /// Spectral radius of the sweeps that their acceleration expects.
-const SPECTRAL_RADIUS: f32 = 0.98;
+const SPECTRAL_RADIUS: f32 = 0.95;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
 const SHADING_RADIUS: usize = 4;
 
@@ -26,8 +29,6 @@ pub(super) struct Smoothing {
     pub(super) window: u32,
     /// Sweeps over the image per linearisation.
     pub(super) iterations: u32,
-    pub(super) radius: f32,
-    pub(super) bend: f32,
 }
 
 impl Smoothing {
@@ -37,8 +38,6 @@ impl Smoothing {
             warps: settings.smoothing_warps,
             window: settings.smoothing_window,
             iterations: settings.smoothing_iterations,
-            radius: settings.k[4],
-            bend: settings.k[0],
         }
     }
 }
@@ -73,8 +72,8 @@ pub(super) fn refine<const C: usize>(
             );
             std::mem::swap(term, &mut mean);
         }
-        link(instructions, &reference.similarity, &flow, smoothing.weight, smoothing.bend, &mut equations);
-        relax(instructions, &equations, smoothing.iterations, smoothing.radius, &mut flow);
+        link(instructions, &reference.similarity, &flow, smoothing.weight, &mut equations);
+        relax(instructions, &equations, smoothing.iterations, &mut flow);
     }
     flow
 }
@@ -206,20 +205,14 @@ fn combine_kernel<S: Simd, const C: usize>(
 simd_kernel! {
     /// Adds the smoothness to the equations and brings them to the form that sweeps use: `x` and `y` the constant
     /// right-hand sides, `xx`, `xy`, `yy` the inverse of the pixel's matrix.
-    fn link(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, scale: f32, equations: &mut Equations) = link_kernel
+    fn link(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, equations: &mut Equations) = link_kernel
 }
 
 #[inline(always)]
-fn link_kernel<S: Simd>(
-    similarity: &[Vec<f32>; 2],
-    flow: &Flow,
-    weight: f32,
-    scale: f32,
-    equations: &mut Equations,
-) {
+fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, equations: &mut Equations) {
     let (width, height) = (flow.width, flow.height);
     let pixels = width * height;
-    let (weight, bend) = (weight * DIFFERENCE_SCALE / scale, 1.0 / (scale * scale));
+    let weight = weight * DIFFERENCE_AT_MOST;
     for (links, step, similarity) in
         [(&mut equations.left, 1, &similarity[0]), (&mut equations.up, width, &similarity[1])]
     {
@@ -230,8 +223,11 @@ fn link_kernel<S: Simd>(
         let (other_u, other_v) = (&flow.u[..count], &flow.v[..count]);
         for i in 0..count {
             let (du, dv) = (u[i] - other_u[i], v[i] - other_v[i]);
-            let stretch = (du * du + dv * dv) * bend + 1.0;
-            links[i] = weight * similarity[i] / stretch.sqrt();
+            let speed = u[i] * u[i] + v[i] * v[i];
+            let scale =
+                DIFFERENCE_AT_REST * DIFFERENCE_AT_REST + DIFFERENCE_BY_MOTION * DIFFERENCE_BY_MOTION * speed;
+            let scale = scale.min(DIFFERENCE_AT_MOST * DIFFERENCE_AT_MOST);
+            links[i] = weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
         }
     }
     let equations = &mut *equations;
@@ -256,11 +252,11 @@ fn link_kernel<S: Simd>(
 simd_kernel! {
     /// Jacobi sweeps, each pixel solving its equations with its neighbours held, with Chebyshev's acceleration (Golub
     /// and Varga, 1961).
-    fn relax(equations: &Equations, sweeps: u32, radius: f32, flow: &mut Flow) = relax_kernel
+    fn relax(equations: &Equations, sweeps: u32, flow: &mut Flow) = relax_kernel
 }
 
 #[inline(always)]
-fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, radius: f32, flow: &mut Flow) {
+fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, flow: &mut Flow) {
     let (width, height) = (flow.width, flow.height);
     // A row before and after, so that every neighbour exists; its links are 0.
     let spare = vec![0.0; width];
@@ -271,7 +267,7 @@ fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, radius: f32, flow: 
         for y in 0..height {
             sweep_row(equations, y, momentum, &current, &mut next);
         }
-        let square = radius * radius;
+        let square = SPECTRAL_RADIUS * SPECTRAL_RADIUS;
         momentum = 1.0 / (1.0 - if sweep == 0 { 0.5 * square } else { 0.25 * square * momentum });
         std::mem::swap(&mut current, &mut next);
     }

@@ -274,7 +274,7 @@ fn tiny_images_and_broken_values_give_finite_tracks() {
 fn extreme_settings_give_finite_tracks() {
     let texture = Texture::new(9, 5.0);
     let frames = [0.0, 2.0, 4.0].map(|shift| render(64, 48, |x, y| texture.at(x - shift, y)));
-    let all_zero = r#"{"max_side":0,"search_side":0,"search_radius":0,"gaps":[0],"patch_stride":0,
+    let all_zero = r#"{"max_side":0,"search_side":0,"search_radius":0,"colour":false,"gaps":[0],"patch_side":0,"patch_stride":0,
         "patch_iterations":0,"smoothness":0,"smoothing_warps":0,"smoothing_window":0,"smoothing_iterations":0,
         "consistency":0,"correlation":0,"sigma_floor":0.01,"hidden_sigma":0}"#;
     track(&frames, &serde_json::from_str(all_zero).unwrap());

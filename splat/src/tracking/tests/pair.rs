@@ -270,7 +270,7 @@ fn bytes_do_not_depend_on_threads_and_hardly_on_instructions() {
             }
             // Rounding may tip the choice between candidates, so single pixels may differ by anything.
             let alike = |i: usize| (flow.0.u[i] - other.0.u[i]).hypot(flow.0.v[i] - other.0.v[i]) < 0.02;
-            assert!(fraction((0..flow.0.u.len()).map(alike)) > 0.98);
+            assert!(fraction((0..flow.0.u.len()).map(alike)) > 0.95);
         }
     }
 }
