@@ -77,6 +77,12 @@ pub(crate) trait Simd: Copy {
     /// In each row, the sum of that row of each argument, taken as `(0 + 2) + (1 + 3)`.
     fn row_sums(arguments: [Self; ROWS]) -> Self;
 
+    /// Each argument half of the lanes.
+    fn load_halves(halves: [&[f32; LANES / 2]; 2]) -> Self;
+    fn store_halves(self, to: [&mut [f32; LANES / 2]; 2]);
+    /// The upper half of `self`, then the lower half of `next`.
+    fn straddle(self, next: Self) -> Self;
+
     /// Each argument a row.
     fn load_rows(rows: [&[f32; ROWS]; ROWS]) -> Self;
     /// Lane `COLUMN` of each row in all lanes of the row.
@@ -139,33 +145,38 @@ pub(crate) fn prefetch<T>(value: &T) {
 }
 
 /// Defines `$name(instructions, arguments)` as the compilation of the generic kernel `$kernel::<impl Simd>` for an
-/// instruction set.
+/// instruction set. Constants that the function is generic over are passed on.
 macro_rules! simd_kernel {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident($($argument:ident: $type:ty),* $(,)?) = $kernel:ident) => {
+    (
+        $(#[$meta:meta])* $vis:vis fn $name:ident $(<$(const $constant:ident: usize),+>)?
+        ($($argument:ident: $type:ty),* $(,)?) = $kernel:ident
+    ) => {
         $(#[$meta])*
-        $vis fn $name(instructions: $crate::simd::Instructions, $($argument: $type),*) {
+        $vis fn $name$(<$(const $constant: usize),+>)?(
+            instructions: $crate::simd::Instructions, $($argument: $type),*
+        ) {
             #[cfg(target_arch = "x86_64")]
             {
                 use $crate::simd::{Avx2, Avx512, InstructionSet};
                 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,popcnt")]
-                fn avx512($($argument: $type),*) {
-                    $kernel::<Avx512>($($argument),*);
+                fn avx512$(<$(const $constant: usize),+>)?($($argument: $type),*) {
+                    $kernel::<Avx512 $($(, $constant)+)?>($($argument),*);
                 }
                 #[target_feature(enable = "avx2,fma")]
-                fn avx2($($argument: $type),*) {
-                    $kernel::<Avx2>($($argument),*);
+                fn avx2$(<$(const $constant: usize),+>)?($($argument: $type),*) {
+                    $kernel::<Avx2 $($(, $constant)+)?>($($argument),*);
                 }
                 match instructions.set() {
                     // SAFETY: `Instructions` exist only for sets that the machine was seen to have.
-                    InstructionSet::Avx512 => return unsafe { avx512($($argument),*) },
+                    InstructionSet::Avx512 => return unsafe { avx512$(::<$($constant),+>)?($($argument),*) },
                     // SAFETY: as above.
-                    InstructionSet::Avx2 => return unsafe { avx2($($argument),*) },
+                    InstructionSet::Avx2 => return unsafe { avx2$(::<$($constant),+>)?($($argument),*) },
                     InstructionSet::Baseline => {}
                 }
             }
             #[cfg(not(target_arch = "x86_64"))]
             let _ = instructions;
-            $kernel::<$crate::simd::Plain>($($argument),*);
+            $kernel::<$crate::simd::Plain $($(, $constant)+)?>($($argument),*);
         }
     };
 }

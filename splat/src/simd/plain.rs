@@ -109,6 +109,23 @@ impl Simd for Plain {
     }
 
     #[inline(always)]
+    fn load_halves(halves: [&[f32; LANES / 2]; 2]) -> Self {
+        Self(std::array::from_fn(|lane| halves[lane / (LANES / 2)][lane % (LANES / 2)]))
+    }
+
+    #[inline(always)]
+    fn store_halves(self, [low, high]: [&mut [f32; LANES / 2]; 2]) {
+        low.copy_from_slice(&self.0[..LANES / 2]);
+        high.copy_from_slice(&self.0[LANES / 2..]);
+    }
+
+    #[inline(always)]
+    fn straddle(self, next: Self) -> Self {
+        let half = LANES / 2;
+        Self(std::array::from_fn(|lane| if lane < half { self.0[lane + half] } else { next.0[lane - half] }))
+    }
+
+    #[inline(always)]
     fn load_rows(rows: [&[f32; ROWS]; ROWS]) -> Self {
         Self(std::array::from_fn(|lane| rows[lane / ROWS][lane % ROWS]))
     }

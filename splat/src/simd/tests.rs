@@ -79,6 +79,13 @@ fn same_as_plain<S: Simd>() {
     }
     assert_eq!(lanes(S::row_sums(f)), lanes(Plain::row_sums(g)));
     run("negated_mul_add", s.negated_mul_add(t, s), p.negated_mul_add(q, p));
+    let (low, high) = (a.first_chunk().unwrap(), b.last_chunk().unwrap());
+    assert_eq!(lanes(S::load_halves([low, high]))[6..10], [a[6], a[7], b[8], b[9]]);
+    let (mut first, mut second) = ([0.0; LANES / 2], [0.0; LANES / 2]);
+    s.store_halves([&mut first, &mut second]);
+    assert_eq!([first, second].as_flattened(), &a[..]);
+    assert_eq!(lanes(s.straddle(t)), lanes(p.straddle(q)));
+    assert_eq!(lanes(s.straddle(t))[6..10], [a[14], a[15], b[0], b[1]]);
     let rows = [[1.0, 2.0, 3.0, 4.0], [5.0; 4], [-1.0, 0.5, 0.25, 8.0], [0.0, 1.0, 0.0, 2.0]];
     let (fast, plain) = (S::load_rows(rows.each_ref()), Plain::load_rows(rows.each_ref()));
     assert_eq!(lanes(fast), rows.concat()[..]);

@@ -84,6 +84,24 @@ impl Simd for Avx512 {
         Self(intrinsic!(_mm512_fnmadd_ps(self.0, factor.0, term.0)))
     }
     #[inline(always)]
+    fn load_halves([low, high]: [&[f32; LANES / 2]; 2]) -> Self {
+        intrinsic!({
+            let low = _mm512_castps256_ps512(_mm256_loadu_ps(low.as_ptr()));
+            Self(_mm512_insertf32x8::<1>(low, _mm256_loadu_ps(high.as_ptr())))
+        })
+    }
+    #[inline(always)]
+    fn store_halves(self, [low, high]: [&mut [f32; LANES / 2]; 2]) {
+        intrinsic!({
+            _mm256_storeu_ps(low.as_mut_ptr(), _mm512_castps512_ps256(self.0));
+            _mm256_storeu_ps(high.as_mut_ptr(), _mm512_extractf32x8_ps::<1>(self.0));
+        });
+    }
+    #[inline(always)]
+    fn straddle(self, next: Self) -> Self {
+        Self(intrinsic!(_mm512_shuffle_f32x4::<0x4E>(self.0, next.0)))
+    }
+    #[inline(always)]
     fn load_rows([a, b, c, d]: [&[f32; ROWS]; ROWS]) -> Self {
         intrinsic!({
             let upper = _mm512_castps128_ps512(_mm_loadu_ps(a.as_ptr()));
@@ -268,6 +286,19 @@ impl Simd for Avx2 {
             intrinsic!(_mm256_fnmadd_ps(self.0, factor.0, term.0)),
             intrinsic!(_mm256_fnmadd_ps(self.1, factor.1, term.1)),
         )
+    }
+    #[inline(always)]
+    fn load_halves([low, high]: [&[f32; LANES / 2]; 2]) -> Self {
+        intrinsic!(Self(_mm256_loadu_ps(low.as_ptr()), _mm256_loadu_ps(high.as_ptr())))
+    }
+    #[inline(always)]
+    fn store_halves(self, [low, high]: [&mut [f32; LANES / 2]; 2]) {
+        intrinsic!(_mm256_storeu_ps(low.as_mut_ptr(), self.0));
+        intrinsic!(_mm256_storeu_ps(high.as_mut_ptr(), self.1));
+    }
+    #[inline(always)]
+    fn straddle(self, next: Self) -> Self {
+        Self(self.1, next.0)
     }
     #[inline(always)]
     fn load_rows([a, b, c, d]: [&[f32; ROWS]; ROWS]) -> Self {

@@ -3,9 +3,15 @@
 //! One cost volume serves both directions: the best match of `x` in the second image and the best match of `y` in
 //! the first are the minima over the same costs.
 
-use super::{flow::Flow, planes::Planes};
+use super::{
+    flow::Flow,
+    planes::{BORDER, Planes},
+    windows::box_mean,
+};
+use crate::simd::{Instructions, Simd, simd_kernel};
 
-/// The best match of every pixel of one image in the other, in pixels of the searched level.
+/// The best match of every pixel of one image in the other, in pixels of the searched level; not a number where it
+/// does not lead back.
 pub(super) struct CoarseMatches {
     pub(super) forward: Flow,
     pub(super) backward: Flow,
@@ -15,6 +21,9 @@ pub(super) struct CoarseMatches {
 const RADIUS: usize = 2;
 /// Half side of the windows whose mean is removed first. Wide, so that a patch keeps its colour.
 const HIGH_PASS_RADIUS: usize = 6;
+
+/// Largest distance along either axis between a pixel and where it comes back to, pixels.
+const ROUND_TRIP: f32 = 1.0;
 
 struct Best {
     cost: Vec<f32>,
@@ -26,12 +35,13 @@ impl Best {
         Self { cost: vec![f32::INFINITY; pixels], label: vec![0; pixels] }
     }
 
+    #[inline(always)]
     fn offer(&mut self, first: usize, costs: &[f32], label: u32) {
-        let best = self.cost[first..first + costs.len()].iter_mut();
-        let labels = self.label[first..first + costs.len()].iter_mut();
-        for ((best, chosen), &cost) in best.zip(labels).zip(costs) {
-            *chosen = if cost < *best { label } else { *chosen };
-            *best = best.min(cost);
+        let best = &mut self.cost[first..first + costs.len()];
+        let labels = &mut self.label[first..first + costs.len()];
+        for i in 0..costs.len() {
+            labels[i] = if costs[i] < best[i] { label } else { labels[i] };
+            best[i] = if costs[i] < best[i] { costs[i] } else { best[i] };
         }
     }
 
@@ -47,52 +57,90 @@ impl Best {
 /// Compares every pixel's window with all windows at most `radius` pixels away along either axis.
 ///
 /// Of equal costs the smallest displacement wins, so identical images match at zero.
-pub(super) fn search(first: &Planes, second: &Planes, radius: usize) -> CoarseMatches {
+pub(super) fn search<const C: usize>(
+    instructions: Instructions,
+    first: &Planes<C>,
+    second: &Planes<C>,
+    radius: usize,
+) -> CoarseMatches {
     let (width, height) = (first.width, first.height);
-    let first = smoothed(&first.high_passed(HIGH_PASS_RADIUS));
-    let second = smoothed(&second.high_passed(HIGH_PASS_RADIUS));
+    let images = [first, second].map(|image| smoothed(&image.high_passed(HIGH_PASS_RADIUS)));
     let displacements = displacements_by_length(radius.min(width - 1), radius.min(height - 1));
+    let mut matches = [Best::new(width * height), Best::new(width * height)];
+    compare_all(instructions, &images, &displacements, &mut matches);
+    let [forward, backward] = matches;
+    let mut forward = forward.into_flow(width, &displacements, 1.0);
+    let mut backward = backward.into_flow(width, &displacements, -1.0);
+    let unverified = forward.clone();
+    verify(&mut forward, &backward);
+    verify(&mut backward, &unverified);
+    CoarseMatches { forward, backward }
+}
 
+/// Marks matches that do not lead back as not found.
+fn verify(flow: &mut Flow, back: &Flow) {
+    for y in 0..flow.height {
+        for x in 0..flow.width {
+            let i = y * flow.width + x;
+            let (u, v) = (flow.u[i], flow.v[i]);
+            let [bu, bv] = back.at((x as f32 + u) as usize, (y as f32 + v) as usize);
+            if !((u + bu).abs() <= ROUND_TRIP && (v + bv).abs() <= ROUND_TRIP) {
+                flow.u[i] = f32::NAN;
+            }
+        }
+    }
+}
+
+simd_kernel! {
+    fn compare_all<const C: usize>(
+        images: &[Planes<C>; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
+    ) = compare_kernel
+}
+
+#[inline(always)]
+fn compare_kernel<S: Simd, const C: usize>(
+    images: &[Planes<C>; 2],
+    displacements: &[[i32; 2]],
+    matches: &mut [Best; 2],
+) {
+    let (width, height) = (images[0].width, images[0].height);
     let mut scratch = Scratch::default();
-    let mut energy = |planes: &Planes| {
-        let mut sums = vec![0.0; width * height];
-        scratch.for_each_row(planes, planes, [0, 0], |y, row| {
-            sums[y * width..(y + 1) * width].copy_from_slice(row);
-        });
-        sums
-    };
-    let (first_energy, second_energy) = (energy(&first), energy(&second));
-
-    let mut forward = Best::new(width * height);
-    let mut backward = Best::new(width * height);
-    let mut costs = vec![0.0f32; width];
+    let mut energies = [vec![0.0f32; width * height], vec![0.0f32; width * height]];
+    for (image, energy) in images.iter().zip(&mut energies) {
+        let overlap = Overlap::new(image, [0, 0]);
+        scratch.sum_rows(image, image, &overlap);
+        for y in 0..height {
+            scratch.sum_columns(y, width);
+            energy[y * width..(y + 1) * width].copy_from_slice(&scratch.row[..width]);
+        }
+    }
+    let [forward, backward] = matches;
     for (label, &[dx, dy]) in displacements.iter().enumerate() {
-        let from_x = (-dx).max(0) as usize;
-        scratch.for_each_row(&first, &second, [dx, dy], |y, row| {
-            let at_first = y * width + from_x;
-            let at_second = (at_first as i64 + dy as i64 * width as i64 + dx as i64) as usize;
-            let costs = &mut costs[..row.len()];
-            let first_energy = &first_energy[at_first..at_first + row.len()];
-            let second_energy = &second_energy[at_second..at_second + row.len()];
-            for i in 0..costs.len() {
-                costs[i] = (first_energy[i] - 2.0 * row[i]) + second_energy[i];
+        let overlap = Overlap::new(&images[0], [dx, dy]);
+        let columns = overlap.columns;
+        scratch.sum_rows(&images[0], &images[1], &overlap);
+        for line in 0..overlap.rows {
+            scratch.sum_columns(line, columns);
+            let at_first = (overlap.first_row + line) * width + overlap.first_column;
+            let at_second = (at_first as i64 + i64::from(dy) * width as i64 + i64::from(dx)) as usize;
+            let first_energy = &energies[0][at_first..at_first + columns];
+            let second_energy = &energies[1][at_second..at_second + columns];
+            let costs = &mut scratch.row[..columns];
+            for i in 0..columns {
+                costs[i] = (first_energy[i] + second_energy[i]) - 2.0 * costs[i];
             }
             forward.offer(at_first, costs, label as u32);
             backward.offer(at_second, costs, label as u32);
-        });
-    }
-    CoarseMatches {
-        forward: forward.into_flow(width, &displacements, 1.0),
-        backward: backward.into_flow(width, &displacements, -1.0),
+        }
     }
 }
 
 /// Binomial smoothing: a displacement of half a coarse pixel must not hide a match.
-fn smoothed(planes: &Planes) -> Planes {
+fn smoothed<const C: usize>(planes: &Planes<C>) -> Planes<C> {
     let interiors = planes.interiors().map(|channel| {
         // Two box filters of different size approximate the binomial well enough.
         let (width, height) = (planes.width, planes.height);
-        let box3 = super::planes::box_mean(&channel, width, height, 1);
+        let box3 = box_mean(&channel, width, height, 1);
         channel.iter().zip(&box3).map(|(value, mean)| 0.5 * (value + mean)).collect()
     });
     Planes::from_interiors(planes.width, planes.height, interiors)
@@ -105,6 +153,28 @@ fn displacements_by_length(radius_x: usize, radius_y: usize) -> Vec<[i32; 2]> {
     all
 }
 
+/// The pixels of the first image whose counterpart at some displacement lies in the second.
+struct Overlap {
+    displacement: [i32; 2],
+    first_column: usize,
+    first_row: usize,
+    columns: usize,
+    rows: usize,
+}
+
+impl Overlap {
+    fn new<const C: usize>(image: &Planes<C>, displacement: [i32; 2]) -> Self {
+        let [dx, dy] = displacement;
+        Self {
+            displacement,
+            first_column: (-dx).max(0) as usize,
+            first_row: (-dy).max(0) as usize,
+            columns: image.width - dx.unsigned_abs() as usize,
+            rows: image.height - dy.unsigned_abs() as usize,
+        }
+    }
+}
+
 /// Window sums of the products of two images, one shifted, computed without allocating per displacement.
 #[derive(Default)]
 struct Scratch {
@@ -114,53 +184,44 @@ struct Scratch {
 }
 
 impl Scratch {
-    /// Calls `visit(y, sums)` for each row `y` of `first` that `second` shifted by `(dx, dy)` overlaps, with the sums
-    /// for the columns that overlap.
-    fn for_each_row(
-        &mut self,
-        first: &Planes,
-        second: &Planes,
-        [dx, dy]: [i32; 2],
-        mut visit: impl FnMut(usize, &[f32]),
-    ) {
-        let overlap = |size: usize, shift: i32| {
-            let (size, shift) = (size as i32, shift);
-            ((-shift).max(0) as usize, (size - shift).min(size) as usize)
-        };
-        let (x0, x1) = overlap(first.width, dx);
-        let (y0, y1) = overlap(first.height, dy);
-        let columns = x1 - x0;
+    /// Sums along the rows of `first` that `second`, shifted, overlaps, and of `RADIUS` rows before and after.
+    #[inline(always)]
+    fn sum_rows<const C: usize>(&mut self, first: &Planes<C>, second: &Planes<C>, overlap: &Overlap) {
+        let columns = overlap.columns;
         let padded = columns + 2 * RADIUS;
-        let window = 2 * RADIUS + 1;
+        let [dx, dy] = overlap.displacement.map(i64::from);
         self.products.resize(padded, 0.0);
-        self.sums.resize((y1 - y0 + 2 * RADIUS) * columns, 0.0);
+        self.sums.resize((overlap.rows + 2 * RADIUS) * columns, 0.0);
         self.row.resize(columns, 0.0);
-
-        let border = super::planes::BORDER;
         for (line, sums) in self.sums.chunks_exact_mut(columns).enumerate() {
-            let at = (y0 + line + border - RADIUS) * first.stride + x0 + border - RADIUS;
-            let shifted = (at as i64 + dy as i64 * second.stride as i64 + dx as i64) as usize;
-            let a = [0, 1, 2].map(|channel: usize| &first.channels[channel][at..at + padded]);
-            let b = [0, 1, 2].map(|channel: usize| &second.channels[channel][shifted..shifted + padded]);
-            for i in 0..padded {
-                self.products[i] = a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i];
+            let row = overlap.first_row + line + BORDER - RADIUS;
+            let at = row * first.stride + overlap.first_column + BORDER - RADIUS;
+            let shifted = (at as i64 + dy * second.stride as i64 + dx) as usize;
+            let products = &mut self.products[..padded];
+            products.fill(0.0);
+            for (a, b) in first.channels.iter().zip(&second.channels) {
+                let (a, b) = (&a[at..at + padded], &b[shifted..shifted + padded]);
+                for i in 0..padded {
+                    products[i] += a[i] * b[i];
+                }
             }
-            let shifts: [&[f32]; 2 * RADIUS + 1] = std::array::from_fn(|s| &self.products[s..s + columns]);
+            let (a, b, c) = (&products[..columns], &products[1..][..columns], &products[2..][..columns]);
+            let (d, e) = (&products[3..][..columns], &products[4..][..columns]);
             for i in 0..columns {
-                sums[i] = shifts[0][i] + shifts[1][i] + shifts[2][i] + shifts[3][i] + shifts[4][i];
+                sums[i] = a[i] + b[i] + c[i] + d[i] + e[i];
             }
         }
-        for y in y0..y1 {
-            let lines: [&[f32]; 2 * RADIUS + 1] = std::array::from_fn(|line| {
-                let from = (y - y0 + line) * columns;
-                &self.sums[from..from + columns]
-            });
-            debug_assert_eq!(lines.len(), window);
-            let row = &mut self.row[..columns];
-            for i in 0..columns {
-                row[i] = lines[0][i] + lines[1][i] + lines[2][i] + lines[3][i] + lines[4][i];
-            }
-            visit(y, row);
+    }
+
+    /// Sums of the rows of sums around the given one, in `row`.
+    #[inline(always)]
+    fn sum_columns(&mut self, line: usize, columns: usize) {
+        let sums = &self.sums[line * columns..(line + 2 * RADIUS + 1) * columns];
+        let (a, b, c) = (&sums[..columns], &sums[columns..][..columns], &sums[2 * columns..][..columns]);
+        let (d, e) = (&sums[3 * columns..][..columns], &sums[4 * columns..][..columns]);
+        let row = &mut self.row[..columns];
+        for i in 0..columns {
+            row[i] = a[i] + b[i] + c[i] + d[i] + e[i];
         }
     }
 }
@@ -184,7 +245,7 @@ mod tests {
             };
             Planes::from_interiors(width, height, [channel(0), channel(1), channel(2)])
         };
-        let matches = search(&crop(30, 30), &crop(19, 36), 12);
+        let matches = search(Instructions::detect(), &crop(30, 30), &crop(19, 36), 12);
         let (mut right, mut all) = (0, 0);
         for y in 10..height - 10 {
             for x in 3..width - 15 {
@@ -194,8 +255,18 @@ mod tests {
             }
         }
         assert_eq!(right, all);
-        let limited = search(&crop(30, 30), &crop(19, 36), 5);
-        assert!(limited.forward.u.iter().chain(&limited.backward.v).all(|&value| value.abs() <= 5.0));
-        assert_eq!(search(&crop(0, 0), &crop(0, 0), 12).forward, Flow::zeros(width, height));
+        let limited = search(Instructions::detect(), &crop(30, 30), &crop(19, 36), 5);
+        assert!(
+            limited
+                .forward
+                .u
+                .iter()
+                .chain(&limited.backward.v)
+                .all(|value| value.is_nan() || value.abs() <= 5.0)
+        );
+        assert_eq!(
+            search(Instructions::detect(), &crop(0, 0), &crop(0, 0), 12).forward,
+            Flow::zeros(width, height)
+        );
     }
 }

@@ -40,19 +40,27 @@ impl Flow {
         [&self.u, &self.v].map(|axis| corners.iter().map(|&(i, weight)| weight * axis[i]).sum())
     }
 
-    /// The same field on a grid of another size, displacements scaled along; `scale` is new over old resolution.
+    /// The same field on a grid of twice the resolution, displacements scaled along.
     /// The nearest value, so that motion boundaries stay sharp.
-    pub(super) fn resampled_nearest(&self, width: usize, height: usize, scale: f32) -> Self {
+    pub(super) fn doubled(&self, width: usize, height: usize) -> Self {
         let mut out = Self::zeros(width, height);
         for y in 0..height {
-            let source_y = (((y as f32 + 0.5) / scale) as usize).min(self.height - 1);
             for x in 0..width {
-                let source_x = (((x as f32 + 0.5) / scale) as usize).min(self.width - 1);
-                let at = self.at(source_x, source_y);
-                out.u[y * width + x] = at[0] * scale;
-                out.v[y * width + x] = at[1] * scale;
+                let [u, v] = self.at(x / 2, y / 2);
+                out.u[y * width + x] = 2.0 * u;
+                out.v[y * width + x] = 2.0 * v;
             }
         }
         out
+    }
+
+    /// Resolution of an image over that of a field that was found on it after halvings, each of which rounds up: a power
+    /// of two, not the ratio of the sizes.
+    pub(super) fn reduction(image: [usize; 2], field: [usize; 2]) -> f32 {
+        let mut halvings = 0;
+        while image[0].div_ceil(1 << halvings) > field[0] || image[1].div_ceil(1 << halvings) > field[1] {
+            halvings += 1;
+        }
+        (1u32 << halvings) as f32
     }
 }

@@ -7,7 +7,6 @@ use super::{
     consistency::Judged,
     flow::Flow,
     pair::{Frame, Guides, match_frames},
-    refine::{Smoothing, refine},
 };
 
 /// The flow from a frame to another, and back, at the finest level of the frames.
@@ -52,7 +51,6 @@ impl PairMatcher for PatchSearch {
     }
 
     fn anchored(&self, key: &Frame, frame: &Frame, tracks: &Judged, settings: &TrackingSettings) -> Flow {
-        let smoothing = Smoothing::of(settings);
-        refine(&key.reference(0), &frame.reference(0), &tracks.flow, Some(&tracks.visible), smoothing)
+        key.refined(frame, tracks.flow.clone(), &tracks.visible, settings)
     }
 }

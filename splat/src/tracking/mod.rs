@@ -8,20 +8,25 @@
 mod chain;
 mod coarse;
 mod consistency;
+mod densify;
 mod fill;
 mod flow;
 pub mod learned;
 mod matcher;
 mod pair;
+mod pair_flow;
 mod patches;
 mod planes;
 mod refine;
 mod settings;
 #[cfg(test)]
 mod tests;
+mod texels;
 mod tracker;
 mod view;
+mod windows;
 
+pub use pair_flow::{DenseFlow, PairFlow, SizesDiffer, pair_flow};
 pub use settings::TrackingSettings;
 pub use tracker::Tracker;
 pub use view::track_view;

@@ -1,41 +1,157 @@
 //! Dense flow between two frames of a view, both ways.
 
 use super::{
-    TrackingSettings, coarse,
+    TrackingSettings,
+    coarse::{self, CoarseMatches},
+    densify::densify,
     flow::Flow,
-    patches::{self, Reference},
+    patches::{self, Guess, PatchField},
     planes::{Planes, pyramid},
-    refine::{self, Smoothing},
+    refine::{Smoothing, refine},
+    texels::Texels,
 };
-use crate::image::Image;
+use crate::{image::Image, simd::Instructions};
 
-/// A frame, prepared for matching: a pyramid with its gradients, finest first.
+/// Colour difference between neighbours that halves their smoothness, 0 to 255 scale.
+const EDGE_SCALE: f32 = 40.0;
+
+/// One level of a frame's pyramid.
+pub(super) struct Level<const C: usize> {
+    pub(super) planes: Planes<C>,
+    pub(super) texels: Texels<C>,
+    /// How alike each pixel is to its left and to its upper neighbour, 1 where equal; 0 where there is none.
+    pub(super) similarity: [Vec<f32>; 2],
+}
+
+impl<const C: usize> Level<C> {
+    pub(super) fn pyramid(finest: Planes<C>, settings: &TrackingSettings) -> Vec<Self> {
+        let level = |planes: Planes<C>| {
+            let texels = Texels::new(&planes);
+            let similarity = similarity(&planes);
+            Self { planes, texels, similarity }
+        };
+        pyramid(finest, settings.search_side as usize).into_iter().map(level).collect()
+    }
+}
+
+fn similarity<const C: usize>(planes: &Planes<C>) -> [Vec<f32>; 2] {
+    let (width, height) = (planes.width, planes.height);
+    let mut similarity = [(); 2].map(|()| vec![0.0f32; width * height]);
+    for y in 0..height {
+        for (axis, step) in [1, planes.stride].into_iter().enumerate() {
+            if axis == 1 && y == 0 {
+                continue;
+            }
+            let line = &mut similarity[axis][y * width..(y + 1) * width];
+            for channel in &planes.channels {
+                let first = planes.index(0, y);
+                let (here, there) = (&channel[first..][..width], &channel[first - step..][..width]);
+                for i in 0..width {
+                    line[i] += (here[i] - there[i]) * (here[i] - there[i]);
+                }
+            }
+            let scale = 1.0 / (C as f32 * EDGE_SCALE * EDGE_SCALE);
+            for value in line.iter_mut() {
+                *value = 1.0 / (1.0 + *value * scale);
+            }
+            if axis == 0 {
+                line[0] = 0.0;
+            }
+        }
+    }
+    similarity
+}
+
+/// What of a frame is matched.
+pub(super) struct Pyramid {
+    levels: Levels,
+    /// The image of the exhaustive search, in colour.
+    searched: Planes,
+}
+
+/// Finest level first.
+pub(super) enum Levels {
+    Luma(Vec<Level<1>>),
+    Colour(Vec<Level<3>>),
+}
+
+impl Pyramid {
+    /// The pyramid of an image that has pixels.
+    pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
+        let halvings = halvings(image, settings.max_side);
+        let levels = if settings.colour {
+            Levels::Colour(Level::pyramid(Planes::from_image(image, halvings), settings))
+        } else {
+            Levels::Luma(Level::pyramid(Planes::luma_of(image, halvings), settings))
+        };
+        let searched = match &levels {
+            Levels::Luma(levels) => Planes::from_image(image, halvings + levels.len() as u32 - 1),
+            Levels::Colour(levels) => levels[levels.len() - 1].planes.clone(),
+        };
+        Self { levels, searched }
+    }
+
+    /// Columns and rows of the finest level.
+    pub(super) fn size(&self) -> [usize; 2] {
+        match &self.levels {
+            Levels::Luma(levels) => levels[0].planes.size(),
+            Levels::Colour(levels) => levels[0].planes.size(),
+        }
+    }
+}
+
+/// How often an image is halved until its longer side has at most so many pixels.
+fn halvings(image: &Image, side: u32) -> u32 {
+    let longer = image.width.max(image.height);
+    (0..31).find(|halvings| longer.div_ceil(1 << halvings) <= side.max(2)).unwrap_or(31)
+}
+
+/// A frame, prepared for matching and for comparison.
 pub(super) struct Frame {
-    pub(super) levels: Vec<Planes>,
-    pub(super) gradients: Vec<[Planes; 2]>,
+    /// The finest level, in colour.
+    pub(super) levels: [Planes; 1],
+    /// Its gradients along x and y.
+    pub(super) gradients: [[Planes; 2]; 1],
+    pyramid: Pyramid,
 }
 
 impl Frame {
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        let finest = Planes::from_image(image);
-        // The pyramid down to the tracking resolution, of which only the end is kept.
-        let mut reduced = pyramid(finest, settings.max_side as usize);
-        let finest = reduced.swap_remove(reduced.len() - 1);
-        let levels = pyramid(finest, settings.search_side as usize);
-        let gradients = levels.iter().map(Planes::gradients).collect();
-        Self { levels, gradients }
+        let pyramid = Pyramid::new(image, settings);
+        let finest = match &pyramid.levels {
+            Levels::Colour(levels) => levels[0].planes.clone(),
+            Levels::Luma(_) => Planes::from_image(image, halvings(image, settings.max_side)),
+        };
+        Self { gradients: [finest.gradients()], levels: [finest], pyramid }
     }
 
+    /// Columns of the finest level.
     pub(super) fn width(&self) -> usize {
         self.levels[0].width
     }
 
+    /// Rows of the finest level.
     pub(super) fn height(&self) -> usize {
         self.levels[0].height
     }
 
-    pub(super) fn reference(&self, level: usize) -> Reference<'_> {
-        Reference { planes: &self.levels[level], gradients: &self.gradients[level] }
+    /// `flow` to another frame, refined at the finest level where `trust` says that colour counts.
+    pub(super) fn refined(
+        &self,
+        other: &Self,
+        flow: Flow,
+        trust: &[bool],
+        settings: &TrackingSettings,
+    ) -> Flow {
+        let (instructions, trust, smoothing) = (Instructions::detect(), Some(trust), Smoothing::of(settings));
+        match (&self.pyramid.levels, &other.pyramid.levels) {
+            (Levels::Luma(a), Levels::Luma(b)) => refine(instructions, &a[0], &b[0], flow, trust, smoothing),
+            (Levels::Colour(a), Levels::Colour(b)) => {
+                refine(instructions, &a[0], &b[0], flow, trust, smoothing)
+            }
+            // Frames of one view have one setting.
+            _ => flow,
+        }
     }
 }
 
@@ -44,6 +160,18 @@ impl Frame {
 pub(super) struct Guides<'a> {
     pub(super) forward: &'a Flow,
     pub(super) backward: &'a Flow,
+    /// Resolution of the finest level over that of these fields.
+    pub(super) scale: f32,
+}
+
+impl<'a> Guides<'a> {
+    fn forward(&self) -> Guess<'a> {
+        Guess { flow: self.forward, scale: self.scale }
+    }
+
+    fn backward(&self) -> Guess<'a> {
+        Guess { flow: self.backward, scale: self.scale }
+    }
 }
 
 /// The flow from `first` to `second` and the flow back, at the finest level. Frames must have the same size.
@@ -53,48 +181,83 @@ pub(super) fn match_frames(
     guides: Option<Guides<'_>>,
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
-    let coarsest = first.levels.len() - 1;
-    let radius =
-        (settings.search_radius.clamp(0.0, 1.0) * first.levels[coarsest].width as f32).round() as usize;
-    let seeds = coarse::search(&first.levels[coarsest], &second.levels[coarsest], radius);
+    match_pyramids(Instructions::detect(), &first.pyramid, &second.pyramid, guides, settings)
+}
+
+/// [`match_frames`] of frames that are only matched, with certain instructions.
+pub(super) fn match_pyramids(
+    instructions: Instructions,
+    first: &Pyramid,
+    second: &Pyramid,
+    guides: Option<Guides<'_>>,
+    settings: &TrackingSettings,
+) -> (Flow, Flow) {
+    let radius = (settings.search_radius.clamp(0.0, 1.0) * first.searched.width as f32).round() as usize;
+    let seeds = coarse::search(instructions, &first.searched, &second.searched, radius);
+    match (&first.levels, &second.levels) {
+        (Levels::Luma(a), Levels::Luma(b)) => match_levels(instructions, a, b, &seeds, guides, settings),
+        (Levels::Colour(a), Levels::Colour(b)) => match_levels(instructions, a, b, &seeds, guides, settings),
+        // Frames of one view have one setting.
+        _ => {
+            let [width, height] = first.size();
+            (Flow::zeros(width, height), Flow::zeros(width, height))
+        }
+    }
+}
+
+fn match_levels<const C: usize>(
+    instructions: Instructions,
+    first: &[Level<C>],
+    second: &[Level<C>],
+    seeds: &CoarseMatches,
+    guides: Option<Guides<'_>>,
+    settings: &TrackingSettings,
+) -> (Flow, Flow) {
+    let (forward, backward) = (guides.map(|guides| guides.forward()), guides.map(|guides| guides.backward()));
     rayon::join(
-        || descend_pyramid(first, second, &seeds.forward, guides.map(|guides| guides.forward), settings),
-        || descend_pyramid(second, first, &seeds.backward, guides.map(|guides| guides.backward), settings),
+        || descend_pyramid(instructions, first, second, &seeds.forward, forward, settings),
+        || descend_pyramid(instructions, second, first, &seeds.backward, backward, settings),
     )
 }
 
-fn descend_pyramid(
-    from: &Frame,
-    to: &Frame,
+fn descend_pyramid<const C: usize>(
+    instructions: Instructions,
+    from: &[Level<C>],
+    to: &[Level<C>],
     seeds: &Flow,
-    guide: Option<&Flow>,
+    guide: Option<Guess<'_>>,
     settings: &TrackingSettings,
 ) -> Flow {
-    let coarsest = from.levels.len() - 1;
+    let coarsest = from.len() - 1;
     let smoothing = Smoothing::of(settings);
-    let mut flow = seeds.clone();
+    let mut flow: Option<Flow> = None;
     for level in (0..=coarsest).rev() {
-        let planes = &from.levels[level];
-        let (width, height) = (planes.width, planes.height);
-        let scale = 0.5f32.powi(level as i32);
-        let seeds = seeds.resampled_nearest(width, height, (1 << (coarsest - level)) as f32);
-        let guide = guide.map(|guide| guide.resampled_nearest(width, height, scale));
-        let mut guesses = vec![&flow, &seeds];
-        guesses.extend(&guide);
-        let stride = if level == 0 { settings.patch_stride } else { settings.patch_stride.div_ceil(2) };
-        let field = patches::search(
-            &from.reference(level),
-            &to.levels[level],
-            &guesses,
-            stride as usize,
-            settings.patch_iterations,
-        );
-        let dense = patches::densify(planes, &to.levels[level], &field);
-        flow = refine::refine(&from.reference(level), &to.reference(level), &dense, None, smoothing);
-        if level > 0 {
-            let finer = &from.levels[level - 1];
-            flow = flow.resampled_nearest(finer.width, finer.height, 2.0);
+        let (reference, target) = (&from[level], &to[level]);
+        let planes = &reference.planes;
+        if level < coarsest && planes.width.max(planes.height) > settings.patch_side as usize {
+            let coarser = flow.unwrap_or_else(|| seeds.clone());
+            let start = coarser.doubled(planes.width, planes.height);
+            flow = Some(refine(instructions, reference, target, start, None, smoothing));
+            continue;
         }
+        let mut guesses = Vec::new();
+        guesses.extend(flow.as_ref().map(|flow| Guess { flow, scale: 2.0 }));
+        let scale = 1.0 / (1u32 << level) as f32;
+        guesses.extend(guide.map(|guide| Guess { scale: guide.scale * scale, ..guide }));
+        let seeds = (level == coarsest).then_some(Guess { flow: seeds, scale: 1.0 });
+        let stride = if level == 0 { settings.patch_stride } else { settings.patch_stride.div_ceil(2) };
+        let mut field = PatchField::new(planes.width, planes.height, stride as usize);
+        patches::search(
+            instructions,
+            planes,
+            &target.planes,
+            &guesses,
+            seeds,
+            settings.patch_iterations,
+            &mut field,
+        );
+        let dense = densify(instructions, planes, &target.planes, &field);
+        flow = Some(refine(instructions, reference, target, dense, None, smoothing));
     }
-    flow
+    flow.unwrap_or_else(|| seeds.clone())
 }

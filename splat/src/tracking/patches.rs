@@ -4,23 +4,36 @@
 
 use super::{
     flow::Flow,
-    planes::{PATCH, PATCH_VALUES, Patch, Planes},
+    planes::{BORDER, PATCH, Planes},
 };
+use crate::simd::{LANES, Simd, simd_kernel};
 
+/// Pixels of a patch.
+pub(super) const PATCH_PIXELS: usize = PATCH * PATCH;
+/// Groups of lanes that hold a patch, two rows each.
+const GROUPS: usize = PATCH_PIXELS / LANES;
 /// Variance of image noise on the 0 to 255 scale that damps badly conditioned patches.
 const NOISE_VARIANCE: f32 = 9.0;
 /// Expected distance of a start from the optimum, pixels: the prior of the damping.
 const START_DEVIATION: f32 = 2.0;
+const DAMPING: f32 = NOISE_VARIANCE / (START_DEVIATION * START_DEVIATION);
 /// How much a difference of mean colour counts against a candidate; 1 would be the plain squared difference.
 /// Shadows and exposure change the mean, but between equally textured candidates the colour decides.
 const MEAN_WEIGHT: f32 = 0.1;
 /// Candidates closer than this to one already tried are not tried again, pixels.
 const SAME_CANDIDATE: f32 = 0.1;
+/// Steps shorter than this end a descent, pixels.
+const SETTLED: f32 = 0.01;
+/// A match found without regard to its neighbours must be better than the others by a factor and by what noise of
+/// some grey levels makes of a difference: patches without texture match anywhere.
+const LEAST_GAIN: f32 = 0.7;
+const LEAST_DIFFERENCE: f32 = 4.0 * PATCH_PIXELS as f32;
+/// Most candidates of a patch.
+const CANDIDATES: usize = 8;
 
 /// Patches on a regular grid and where they went.
 pub(super) struct PatchField {
     pub(super) columns: usize,
-    pub(super) rows: usize,
     /// Top-left pixel of each patch column and of each patch row.
     pub(super) xs: Vec<usize>,
     pub(super) ys: Vec<usize>,
@@ -29,88 +42,16 @@ pub(super) struct PatchField {
     pub(super) cost: Vec<f32>,
 }
 
-/// One level of the frame that patches are taken from.
-pub(super) struct Reference<'a> {
-    pub(super) planes: &'a Planes,
-    pub(super) gradients: &'a [Planes; 2],
-}
-
-struct Template {
-    values: Patch,
-    gradient: [Patch; 2],
-    /// Damped Gauss-Newton matrix `xx, xy, yy`.
-    matrix: [f32; 3],
-}
-
-const DAMPING: f32 = NOISE_VARIANCE / (START_DEVIATION * START_DEVIATION);
-
-impl Template {
-    fn new(reference: &Reference<'_>, x: usize, y: usize) -> Self {
-        let gradient = [0, 1].map(|axis: usize| centred(&reference.gradients[axis].patch(x, y)));
-        let matrix = [
-            dot(&gradient[0], &gradient[0]) + DAMPING,
-            dot(&gradient[0], &gradient[1]),
-            dot(&gradient[1], &gradient[1]) + DAMPING,
-        ];
-        Self { values: reference.planes.patch(x, y), gradient, matrix }
-    }
-
-    /// The difference image of the patch, and its cost.
-    fn compare(&self, target: &Planes, x: f32, y: f32) -> (Patch, f32) {
-        let mut difference = target.patch_at(x, y);
-        difference.iter_mut().zip(&self.values).for_each(|(there, here)| *there -= here);
-        let mut cost = 0.0;
-        for channel in difference.as_chunks::<{ PATCH * PATCH }>().0 {
-            let (sum, squares) = sums(channel);
-            cost += squares - (1.0 - MEAN_WEIGHT) * sum * sum / (PATCH * PATCH) as f32;
-        }
-        (difference, cost.max(0.0))
-    }
-
-    /// The step that Gauss-Newton takes from a difference image, with the prior on the distance to the start.
-    fn step(&self, difference: &Patch, from_start: [f32; 2]) -> [f32; 2] {
-        let right = [0, 1].map(|axis| dot(&self.gradient[axis], difference) + DAMPING * from_start[axis]);
-        let [xx, xy, yy] = self.matrix;
-        // Positive: the damping is added to a positive semidefinite matrix.
-        let determinant = xx * yy - xy * xy;
-        [(yy * right[0] - xy * right[1]) / determinant, (xx * right[1] - xy * right[0]) / determinant]
+impl PatchField {
+    /// A field of `width * height` pixels whose patches lie every `stride` pixels and flush with the end.
+    pub(super) fn new(width: usize, height: usize, stride: usize) -> Self {
+        let (xs, ys) = (grid(width, stride), grid(height, stride));
+        let patches = xs.len() * ys.len();
+        let (displacement, cost) = (vec![[0.0; 2]; patches], vec![f32::INFINITY; patches]);
+        Self { columns: xs.len(), xs, ys, displacement, cost }
     }
 }
 
-fn sums(values: &[f32; PATCH * PATCH]) -> (f32, f32) {
-    let mut sum = [0.0f32; PATCH];
-    let mut squares = [0.0f32; PATCH];
-    for row in values.as_chunks::<PATCH>().0 {
-        for i in 0..PATCH {
-            sum[i] += row[i];
-            squares[i] += row[i] * row[i];
-        }
-    }
-    (sum.iter().sum(), squares.iter().sum())
-}
-
-fn dot(a: &Patch, b: &Patch) -> f32 {
-    let mut lanes = [0.0f32; PATCH];
-    for (a, b) in a.as_chunks::<PATCH>().0.iter().zip(b.as_chunks::<PATCH>().0) {
-        for i in 0..PATCH {
-            lanes[i] += a[i] * b[i];
-        }
-    }
-    lanes.iter().sum()
-}
-
-/// The patch minus the mean of each channel: products with it ignore a constant offset.
-fn centred(patch: &Patch) -> Patch {
-    let mut out = [0.0; PATCH_VALUES];
-    let channels = patch.as_chunks::<{ PATCH * PATCH }>().0.iter();
-    for (channel, out) in channels.zip(out.as_chunks_mut::<{ PATCH * PATCH }>().0) {
-        let mean = sums(channel).0 / (PATCH * PATCH) as f32;
-        out.iter_mut().zip(channel).for_each(|(out, value)| *out = value - mean);
-    }
-    out
-}
-
-/// Positions of patches along an axis: every `stride` pixels, the last one flush with the end.
 fn grid(size: usize, stride: usize) -> Vec<usize> {
     let last = size.saturating_sub(PATCH);
     let mut at: Vec<usize> = (0..last).step_by(stride.max(1)).collect();
@@ -118,173 +59,359 @@ fn grid(size: usize, stride: usize) -> Vec<usize> {
     at
 }
 
-struct Search<'a> {
-    target: &'a Planes,
-    iterations: u32,
+/// A field that patches may start from.
+#[derive(Clone, Copy)]
+pub(super) struct Guess<'a> {
+    pub(super) flow: &'a Flow,
+    /// Resolution of the patches over that of the field.
+    pub(super) scale: f32,
 }
 
-impl Search<'_> {
-    /// The best of the candidates, improved by descent.
-    fn improve(&self, template: &Template, x: f32, y: f32, candidates: &[[f32; 2]]) -> ([f32; 2], f32) {
-        let mut tried: [[f32; 2]; 12] = [[f32::INFINITY; 2]; 12];
-        let mut best = ([0.0; 2], f32::INFINITY);
-        for (n, &candidate) in candidates.iter().enumerate() {
-            let known = |seen: &[f32; 2]| {
-                (seen[0] - candidate[0]).abs() + (seen[1] - candidate[1]).abs() < SAME_CANDIDATE
-            };
-            if tried.iter().any(known) {
-                continue;
-            }
-            tried[n % 12] = candidate;
-            let (_, cost) = template.compare(self.target, x + candidate[0], y + candidate[1]);
-            if cost < best.1 {
-                best = (candidate, cost);
-            }
+impl Guess<'_> {
+    /// The nearest value: between two motions lies none.
+    fn at(&self, x: f32, y: f32) -> [f32; 2] {
+        let column = ((x / self.scale) as usize).min(self.flow.width - 1);
+        let row = ((y / self.scale) as usize).min(self.flow.height - 1);
+        self.flow.at(column, row).map(|value| value * self.scale)
+    }
+}
+
+/// A patch in registers, two rows per group.
+pub(super) type Pixels<S> = [S; GROUPS];
+
+/// The patch whose top-left pixel has the fractional index `(x, y)`, bilinear; far outside is the border.
+pub(super) struct Window<S> {
+    first: usize,
+    fx: S,
+    fy: S,
+}
+
+impl<S: Simd> Window<S> {
+    #[inline(always)]
+    pub(super) fn new<const C: usize>(planes: &Planes<C>, x: f32, y: f32) -> Self {
+        let least = -(PATCH as f32 + 1.0);
+        // Shifting by the border makes the coordinates positive, so truncation is the floor.
+        let x = x.clamp(least, planes.width as f32) + BORDER as f32;
+        let y = y.clamp(least, planes.height as f32) + BORDER as f32;
+        let (column, row) = (x as usize, y as usize);
+        Self {
+            first: row * planes.stride + column,
+            fx: S::splat(x - column as f32),
+            fy: S::splat(y - row as f32),
         }
-        self.descend(template, x, y, best)
     }
 
-    fn descend(&self, template: &Template, x: f32, y: f32, start: ([f32; 2], f32)) -> ([f32; 2], f32) {
-        let mut best = start;
-        let mut at = start.0;
-        for _ in 0..self.iterations {
-            let (difference, cost) = template.compare(self.target, x + at[0], y + at[1]);
-            if cost > best.1 {
-                break;
+    #[inline(always)]
+    pub(super) fn fetch(&self, channel: &[f32], stride: usize) -> Pixels<S> {
+        let mut rows = [S::splat(0.0); GROUPS + 1];
+        for pair in 0..GROUPS {
+            let at = self.first + 2 * pair * stride;
+            rows[pair] = self.blend(line(channel, at), line(channel, at + stride));
+        }
+        let last = line(channel, self.first + PATCH * stride);
+        rows[GROUPS] = self.blend(last, last);
+        let mut pixels = [S::splat(0.0); GROUPS];
+        for pair in 0..GROUPS {
+            let below = rows[pair].straddle(rows[pair + 1]);
+            pixels[pair] = below.sub(rows[pair]).mul_add(self.fy, rows[pair]);
+        }
+        pixels
+    }
+
+    /// Two rows, interpolated along x.
+    #[inline(always)]
+    fn blend(&self, upper: &[f32; PATCH + 1], lower: &[f32; PATCH + 1]) -> S {
+        let left = S::load_halves([part::<0>(upper), part::<0>(lower)]);
+        let right = S::load_halves([part::<1>(upper), part::<1>(lower)]);
+        right.sub(left).mul_add(self.fx, left)
+    }
+}
+
+/// A patch's row and the pixels that interpolation needs beyond it.
+#[inline(always)]
+pub(super) fn line<const LENGTH: usize>(channel: &[f32], first: usize) -> &[f32; LENGTH] {
+    let (line, _) = channel[first..].split_first_chunk().unwrap_or_else(|| beyond_the_border());
+    line
+}
+
+#[cold]
+fn beyond_the_border() -> ! {
+    unreachable!("a patch reaches at most one pixel less than the border")
+}
+
+/// The row's pixels from `SHIFT` on.
+#[inline(always)]
+fn part<const SHIFT: usize>(line: &[f32; PATCH + 1]) -> &[f32; PATCH] {
+    let (low, high) = (line.first_chunk(), line.last_chunk());
+    let part = if SHIFT == 0 { low } else { high };
+    part.unwrap_or_else(|| beyond_the_border())
+}
+
+#[inline(always)]
+fn pair_of_rows<S: Simd>(channel: &[f32], upper: usize, lower: usize) -> S {
+    S::load_halves([line(channel, upper), line(channel, lower)])
+}
+
+/// The sum over the lanes of each argument.
+#[inline(always)]
+pub(super) fn totals<S: Simd>(of: [S; 4]) -> [f32; 4] {
+    let mut lanes = [0.0; LANES];
+    S::row_sums(of).store(&mut lanes);
+    let mut totals = [0.0; 4];
+    for k in 0..4 {
+        totals[k] = (lanes[k] + lanes[4 + k]) + (lanes[8 + k] + lanes[12 + k]);
+    }
+    totals
+}
+
+#[inline(always)]
+fn sum<S: Simd>(pixels: &Pixels<S>) -> S {
+    pixels[0].add(pixels[1]).add(pixels[2].add(pixels[3]))
+}
+
+#[inline(always)]
+fn products<S: Simd>(a: &Pixels<S>, b: &Pixels<S>) -> S {
+    let upper = a[1].mul_add(b[1], a[0].mul(b[0]));
+    let lower = a[3].mul_add(b[3], a[2].mul(b[2]));
+    upper.add(lower)
+}
+
+/// A patch of the reference, its gradients without their mean, and the inverse of the damped Gauss-Newton matrix.
+struct Template<S, const C: usize> {
+    channels: [[Pixels<S>; 3]; C],
+    inverse: [f32; 3],
+}
+
+/// What descent needs to know of a patch at some displacement.
+#[derive(Clone, Copy)]
+struct Comparison {
+    cost: f32,
+    right: [f32; 2],
+}
+
+impl<S: Simd, const C: usize> Template<S, C> {
+    #[inline(always)]
+    fn new(planes: &Planes<C>, x: usize, y: usize) -> Self {
+        let stride = planes.stride;
+        let first = planes.index(x, y);
+        let half = S::splat(0.5);
+        let mut channels = [[[S::splat(0.0); GROUPS]; 3]; C];
+        let mut matrix = [DAMPING, 0.0, DAMPING];
+        for (template, channel) in channels.iter_mut().zip(&planes.channels) {
+            for pair in 0..GROUPS {
+                let (upper, lower) = (first + 2 * pair * stride, first + (2 * pair + 1) * stride);
+                let right: S = pair_of_rows(channel, upper + 1, lower + 1);
+                let left = pair_of_rows(channel, upper - 1, lower - 1);
+                let below: S = pair_of_rows(channel, lower, lower + stride);
+                let above = pair_of_rows(channel, upper - stride, upper);
+                template[0][pair] = pair_of_rows(channel, upper, lower);
+                template[1][pair] = right.sub(left).mul(half);
+                template[2][pair] = below.sub(above).mul(half);
             }
-            best = (at, cost);
-            let from_start = [at[0] - start.0[0], at[1] - start.0[1]];
-            let step = template.step(&difference, from_start);
-            at = [at[0] - step[0], at[1] - step[1]];
-            let moved = (at[0] - start.0[0]).abs().max((at[1] - start.0[1]).abs());
-            let settled = step[0].abs().max(step[1].abs()) < 0.01;
+            let none = S::splat(0.0);
+            let means = totals([sum(&template[1]), sum(&template[2]), none, none]);
+            for axis in 0..2 {
+                let mean = S::splat(means[axis] / PATCH_PIXELS as f32);
+                for pair in 0..GROUPS {
+                    template[1 + axis][pair] = template[1 + axis][pair].sub(mean);
+                }
+            }
+            let [_, gx, gy] = &*template;
+            let [xx, xy, yy, _] = totals([products(gx, gx), products(gx, gy), products(gy, gy), none]);
+            matrix = [matrix[0] + xx, matrix[1] + xy, matrix[2] + yy];
+        }
+        // Positive: the damping is added to a positive semidefinite matrix.
+        let determinant = matrix[0] * matrix[2] - matrix[1] * matrix[1];
+        let inverse = [matrix[2] / determinant, -matrix[1] / determinant, matrix[0] / determinant];
+        Self { channels, inverse }
+    }
+
+    #[inline(always)]
+    fn compare(&self, target: &Planes<C>, x: f32, y: f32) -> Comparison {
+        let window = Window::<S>::new(target, x, y);
+        let mut comparison = Comparison { cost: 0.0, right: [0.0; 2] };
+        for (template, channel) in self.channels.iter().zip(&target.channels) {
+            let mut off = window.fetch(channel, target.stride);
+            for pair in 0..GROUPS {
+                off[pair] = off[pair].sub(template[0][pair]);
+            }
+            let [total, squares, along_x, along_y] = totals([
+                sum(&off),
+                products(&off, &off),
+                products(&off, &template[1]),
+                products(&off, &template[2]),
+            ]);
+            let mean_share = (1.0 - MEAN_WEIGHT) / PATCH_PIXELS as f32;
+            comparison.cost += (squares - mean_share * total * total).max(0.0);
+            comparison.right[0] += along_x;
+            comparison.right[1] += along_y;
+        }
+        comparison
+    }
+
+    /// The step that Gauss-Newton takes, with the prior on the distance to the start.
+    #[inline(always)]
+    fn step(&self, comparison: &Comparison, from_start: [f32; 2]) -> [f32; 2] {
+        let right =
+            [comparison.right[0] + DAMPING * from_start[0], comparison.right[1] + DAMPING * from_start[1]];
+        let [xx, xy, yy] = self.inverse;
+        [xx * right[0] + xy * right[1], xy * right[0] + yy * right[1]]
+    }
+
+    /// The best of the candidates, improved by descent if it is not the first or the first is to be improved too.
+    #[inline(always)]
+    fn improve(
+        &self,
+        target: &Planes<C>,
+        [x, y]: [f32; 2],
+        candidates: &Candidates,
+        iterations: u32,
+        improve_first: bool,
+    ) -> ([f32; 2], f32) {
+        let mut start = candidates.list[0];
+        let mut best = self.compare(target, x + start[0], y + start[1]);
+        let mut is_first = true;
+        for n in 1..candidates.count {
+            let candidate = candidates.list[n];
+            let comparison = self.compare(target, x + candidate[0], y + candidate[1]);
+            let bound =
+                if n < candidates.trusted { best.cost } else { LEAST_GAIN * best.cost - LEAST_DIFFERENCE };
+            if comparison.cost < bound {
+                (start, best, is_first) = (candidate, comparison, false);
+            }
+        }
+        if is_first && !improve_first {
+            return (start, best.cost);
+        }
+        self.descend(target, [x, y], start, best, iterations)
+    }
+
+    #[inline(always)]
+    fn descend(
+        &self,
+        target: &Planes<C>,
+        [x, y]: [f32; 2],
+        start: [f32; 2],
+        mut best: Comparison,
+        iterations: u32,
+    ) -> ([f32; 2], f32) {
+        let mut at = start;
+        for _ in 0..iterations {
+            let from_start = [at[0] - start[0], at[1] - start[1]];
+            let step = self.step(&best, from_start);
+            let next = [at[0] - step[0], at[1] - step[1]];
+            let moved = (next[0] - start[0]).abs().max((next[1] - start[1]).abs());
             // A patch that runs away from its start has left the basin that the start was chosen for.
-            if settled || moved > PATCH as f32 || !moved.is_finite() {
+            if !(moved <= PATCH as f32) {
+                break;
+            }
+            let comparison = self.compare(target, x + next[0], y + next[1]);
+            if !(comparison.cost < best.cost) {
+                break;
+            }
+            (at, best) = (next, comparison);
+            if step[0].abs().max(step[1].abs()) < SETTLED {
                 break;
             }
         }
-        best
+        (at, best.cost)
     }
 }
 
-/// Matches every patch of `reference` in `target`.
-///
-/// Candidates of a patch are the fields of `guesses` at its centre, zero, and what its neighbours found: those
-/// left and above in the first pass, those right and below in the second.
-pub(super) fn search(
-    reference: &Reference<'_>,
-    target: &Planes,
-    guesses: &[&Flow],
-    stride: usize,
-    iterations: u32,
-) -> PatchField {
-    let (width, height) = (reference.planes.width, reference.planes.height);
-    let (xs, ys) = (grid(width, stride), grid(height, stride));
-    let (columns, rows) = (xs.len(), ys.len());
-    let mut displacement = vec![[0.0f32; 2]; columns * rows];
-    let mut cost = vec![f32::INFINITY; columns * rows];
-    let pass = Search { target, iterations: iterations.div_ceil(2) };
-    let mut candidates: Vec<[f32; 2]> = Vec::new();
+/// Displacements to try, without repetitions.
+#[derive(Default)]
+struct Candidates {
+    trusted: usize,
+    list: [[f32; 2]; CANDIDATES],
+    count: usize,
+}
 
+impl Candidates {
+    #[inline(always)]
+    fn offer(&mut self, candidate: [f32; 2]) {
+        if self.count == CANDIDATES || !(candidate[0] + candidate[1]).is_finite() {
+            return;
+        }
+        for seen in &self.list[..self.count] {
+            if (seen[0] - candidate[0]).abs() + (seen[1] - candidate[1]).abs() < SAME_CANDIDATE {
+                return;
+            }
+        }
+        self.list[self.count] = candidate;
+        self.count += 1;
+    }
+}
+
+simd_kernel! {
+    /// Matches every patch of `reference` in `target`.
+    ///
+    /// Candidates of a patch are the fields of `guesses` at its centre, zero, and what its neighbours found: those
+    /// left and above in the first pass, those right and below in the second.
+    pub(super) fn search<const C: usize>(
+        reference: &Planes<C>, target: &Planes<C>, guesses: &[Guess<'_>],
+        seeds: Option<Guess<'_>>, iterations: u32, field: &mut PatchField,
+    ) = search_kernel
+}
+
+#[inline(always)]
+fn search_kernel<S: Simd, const C: usize>(
+    reference: &Planes<C>,
+    target: &Planes<C>,
+    guesses: &[Guess<'_>],
+    seeds: Option<Guess<'_>>,
+    iterations: u32,
+    field: &mut PatchField,
+) {
+    let (columns, rows) = (field.columns, field.ys.len());
     for j in 0..rows {
         for i in 0..columns {
             let at = j * columns + i;
-            let (x, y) = (xs[i], ys[j]);
-            candidates.clear();
-            candidates.push([0.0; 2]);
-            let centre = ((x + PATCH / 2).min(width - 1), (y + PATCH / 2).min(height - 1));
-            candidates.extend(guesses.iter().map(|guess| guess.at(centre.0, centre.1)));
+            let (x, y) = (field.xs[i], field.ys[j]);
+            let centre = [
+                (x + PATCH / 2).min(reference.width - 1) as f32 + 0.5,
+                (y + PATCH / 2).min(reference.height - 1) as f32 + 0.5,
+            ];
+            let mut candidates = Candidates::default();
+            for guess in guesses {
+                candidates.offer(guess.at(centre[0], centre[1]));
+            }
+            candidates.offer([0.0; 2]);
             let neighbours = [(i > 0, 1), (j > 0, columns), (i > 0 && j > 0, columns + 1)];
-            candidates.extend(
-                neighbours.iter().filter(|(exists, _)| *exists).map(|&(_, back)| displacement[at - back]),
-            );
-            let template = Template::new(reference, x, y);
-            (displacement[at], cost[at]) = pass.improve(&template, x as f32, y as f32, &candidates);
+            for (exists, back) in neighbours {
+                if exists {
+                    candidates.offer(field.displacement[at - back]);
+                }
+            }
+            candidates.trusted = candidates.count;
+            if let Some(seeds) = seeds {
+                candidates.offer(seeds.at(centre[0], centre[1]));
+            }
+            let template = Template::<S, C>::new(reference, x, y);
+            let corner = [x as f32, y as f32];
+            (field.displacement[at], field.cost[at]) =
+                template.improve(target, corner, &candidates, iterations, true);
         }
     }
     for j in (0..rows).rev() {
         for i in (0..columns).rev() {
             let at = j * columns + i;
-            candidates.clear();
-            candidates.push(displacement[at]);
+            let mut candidates = Candidates::default();
+            candidates.offer(field.displacement[at]);
             let (right, below) = (i + 1 < columns, j + 1 < rows);
             let neighbours = [(right, 1), (below, columns), (right && below, columns + 1)];
-            candidates.extend(
-                neighbours.iter().filter(|(exists, _)| *exists).map(|&(_, ahead)| displacement[at + ahead]),
-            );
-            let template = Template::new(reference, xs[i], ys[j]);
-            (displacement[at], cost[at]) = pass.improve(&template, xs[i] as f32, ys[j] as f32, &candidates);
-        }
-    }
-    PatchField { columns, rows, xs, ys, displacement, cost }
-}
-
-/// Residual at which a pixel stops to believe a patch, on the 0 to 255 scale.
-const RESIDUAL_SCALE: f32 = 6.0;
-/// Displacements closer than this belong to the same motion and are averaged, pixels.
-const SAME_MOTION: f32 = 1.0;
-
-/// One displacement per pixel from the patches that cover it: the patch that explains the pixel best picks the
-/// motion, patches that agree with it are averaged. Averaging over different motions would put pixels of an edge
-/// between them.
-pub(super) fn densify(reference: &Planes, target: &Planes, field: &PatchField) -> Flow {
-    let (width, height) = (reference.width, reference.height);
-    let weights: Vec<[f32; PATCH * PATCH]> =
-        (0..field.columns * field.rows).map(|at| pixel_weights(reference, target, field, at)).collect();
-
-    let mut best_weight = vec![-1.0f32; width * height];
-    let mut best = vec![[0.0f32; 2]; width * height];
-    for_each_pixel(field, width, height, |pixel, patch, inside| {
-        if weights[patch][inside] > best_weight[pixel] {
-            best_weight[pixel] = weights[patch][inside];
-            best[pixel] = field.displacement[patch];
-        }
-    });
-    let mut flow = Flow::zeros(width, height);
-    let mut total = vec![0.0f32; width * height];
-    for_each_pixel(field, width, height, |pixel, patch, inside| {
-        let [u, v] = field.displacement[patch];
-        if (u - best[pixel][0]).abs().max((v - best[pixel][1]).abs()) > SAME_MOTION {
-            return;
-        }
-        let weight = weights[patch][inside];
-        flow.u[pixel] += weight * u;
-        flow.v[pixel] += weight * v;
-        total[pixel] += weight;
-    });
-    // Every pixel is covered, and weights are positive.
-    for axis in [&mut flow.u, &mut flow.v] {
-        axis.iter_mut().zip(&total).for_each(|(value, total)| *value /= total);
-    }
-    flow
-}
-
-/// Calls `visit(pixel, patch, index in patch)` for each pixel of the image that a patch covers.
-fn for_each_pixel(
-    field: &PatchField,
-    width: usize,
-    height: usize,
-    mut visit: impl FnMut(usize, usize, usize),
-) {
-    for (j, &y) in field.ys.iter().enumerate() {
-        for (i, &x) in field.xs.iter().enumerate() {
-            for row in 0..PATCH.min(height - y) {
-                for column in 0..PATCH.min(width - x) {
-                    visit((y + row) * width + x + column, j * field.columns + i, row * PATCH + column);
+            for (exists, ahead) in neighbours {
+                if exists {
+                    candidates.offer(field.displacement[at + ahead]);
                 }
             }
+            if candidates.count == 1 {
+                continue;
+            }
+            candidates.trusted = candidates.count;
+            let template = Template::<S, C>::new(reference, field.xs[i], field.ys[j]);
+            let corner = [field.xs[i] as f32, field.ys[j] as f32];
+            (field.displacement[at], field.cost[at]) =
+                template.improve(target, corner, &candidates, iterations, false);
         }
     }
-}
-
-fn pixel_weights(reference: &Planes, target: &Planes, field: &PatchField, at: usize) -> [f32; PATCH * PATCH] {
-    let (x, y) = (field.xs[at % field.columns], field.ys[at / field.columns]);
-    let [u, v] = field.displacement[at];
-    let mut difference = target.patch_at(x as f32 + u, y as f32 + v);
-    difference.iter_mut().zip(&reference.patch(x, y)).for_each(|(there, here)| *there -= here);
-    let difference = centred(&difference);
-    let (r, g, b) = (&difference[..64], &difference[64..128], &difference[128..]);
-    let scale = RESIDUAL_SCALE * RESIDUAL_SCALE;
-    let patch = 1.0 / (scale + field.cost[at] / PATCH_VALUES as f32);
-    std::array::from_fn(|i| patch / (scale + (r[i] * r[i] + g[i] * g[i] + b[i] * b[i]) / 3.0))
 }

@@ -1,44 +1,121 @@
-//! Colour planes with a replicated border, their pyramid, and the sampling that everything else is made of.
+//! Channels of an image with a replicated border, and their pyramid.
 
+pub(super) use super::windows::{box_counts, box_mean, box_sum};
 use crate::image::Image;
 
 /// Side of a patch, pixels. A constant, so that the loops over a patch have a known length and vectorise.
 pub(super) const PATCH: usize = 8;
-/// Values of a patch: three channels, row by row.
-pub(super) const PATCH_VALUES: usize = 3 * PATCH * PATCH;
 /// Replicated pixels on every side: a whole patch fits outside the image, with one more pixel to interpolate.
 pub(super) const BORDER: usize = PATCH + 2;
 
-/// The values of one patch, channel by channel.
-pub(super) type Patch = [f32; PATCH_VALUES];
+/// Share of each channel in luma (ITU-R BT.601).
+const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 
-/// Three `f32` channels on the 0 to 255 scale, each with `BORDER` replicated pixels on every side.
+/// `f32` channels on the 0 to 255 scale, each with `BORDER` replicated pixels on every side.
 #[derive(Clone, Debug)]
-pub(super) struct Planes {
+pub(super) struct Planes<const CHANNELS: usize = 3> {
     pub(super) width: usize,
     pub(super) height: usize,
     pub(super) stride: usize,
-    pub(super) channels: [Vec<f32>; 3],
+    pub(super) channels: [Vec<f32>; CHANNELS],
 }
 
 impl Planes {
-    /// Planes of an image; values that are not finite become 0.
-    pub(super) fn from_image(image: &Image) -> Self {
-        let (width, height) = (image.width as usize, image.height as usize);
-        let interior = |channel: usize| -> Vec<f32> {
-            let values = image.pixels.iter().skip(channel).step_by(3);
-            values
-                .map(|&value| if value.is_finite() { 255.0 * value.clamp(-4.0, 4.0) } else { 0.0 })
-                .collect()
-        };
-        Self::from_interiors(width, height, [interior(0), interior(1), interior(2)])
+    /// Planes of an image, halved so many times; values that are not finite become 0.
+    pub(super) fn from_image(image: &Image, halvings: u32) -> Self {
+        Self::block_means(image, halvings, |colour| colour)
+    }
+}
+
+impl Planes<1> {
+    /// The luma of an image, halved so many times; values that are not finite count as 0.
+    pub(super) fn luma_of(image: &Image, halvings: u32) -> Self {
+        Self::block_means(image, halvings, |[r, g, b]| [LUMA[0] * r + LUMA[1] * g + LUMA[2] * b])
+    }
+}
+
+fn grey_levels(value: f32) -> f32 {
+    let value = if value.is_finite() { value } else { 0.0 };
+    255.0 * value.clamp(-4.0, 4.0)
+}
+
+impl<const CHANNELS: usize> Planes<CHANNELS> {
+    /// Adds the border to channels of `height * width` values.
+    pub(super) fn from_interiors(width: usize, height: usize, interiors: [Vec<f32>; CHANNELS]) -> Self {
+        Self::from_rows(width, height, |channel, y, row| {
+            row.copy_from_slice(&interiors[channel][y * width..(y + 1) * width]);
+        })
     }
 
-    /// Adds the border to three channels of `height * width` values.
-    pub(super) fn from_interiors(width: usize, height: usize, interiors: [Vec<f32>; 3]) -> Self {
+    /// Planes whose rows `fill(channel, row, values)` writes; all values start as 0.
+    pub(super) fn from_rows(
+        width: usize,
+        height: usize,
+        mut fill: impl FnMut(usize, usize, &mut [f32]),
+    ) -> Self {
         let stride = width + 2 * BORDER;
-        let channels = interiors.map(|interior| with_border(&interior, width, height));
+        let mut channel = 0;
+        let channels = [(); CHANNELS].map(|()| {
+            let mut values = vec![0.0f32; stride * (height + 2 * BORDER)];
+            for (y, line) in values.chunks_exact_mut(stride).skip(BORDER).take(height).enumerate() {
+                fill(channel, y, &mut line[BORDER..BORDER + width]);
+                let (left, right) = (line[BORDER], line[BORDER + width - 1]);
+                line[..BORDER].fill(left);
+                line[BORDER + width..].fill(right);
+            }
+            let (top, bottom) = (BORDER * stride, (BORDER + height - 1) * stride);
+            for y in 0..BORDER {
+                values.copy_within(top..top + stride, y * stride);
+                values.copy_within(bottom..bottom + stride, (BORDER + height + y) * stride);
+            }
+            channel += 1;
+            values
+        });
         Self { width, height, stride, channels }
+    }
+
+    /// Means over blocks of `2^halvings` pixels along either axis; blocks that the image does not fill go on with its last
+    /// column and row.
+    fn block_means(image: &Image, halvings: u32, mix: impl Fn([f32; 3]) -> [f32; CHANNELS]) -> Self {
+        let [image_width, image_height] = [image.width as usize, image.height as usize];
+        let side = 1 << halvings;
+        let (width, height) = (image_width.div_ceil(side), image_height.div_ceil(side));
+        let mut line = vec![[0.0f32; 3]; width * side];
+        let mut sums = vec![[0.0f32; CHANNELS]; width * height];
+        for y in 0..height * side {
+            let from = 3 * image_width * y.min(image_height - 1);
+            let values = &image.pixels[from..from + 3 * image_width];
+            let levels = line[..image_width].as_flattened_mut();
+            levels.iter_mut().zip(values).for_each(|(level, &value)| *level = grey_levels(value));
+            let last = line[image_width - 1];
+            line[image_width..].fill(last);
+            let sums = &mut sums[y / side * width..][..width];
+            for (sum, block) in sums.iter_mut().zip(line.chunks_exact(side)) {
+                for &colour in block {
+                    let mixed = mix(colour);
+                    for (sum, value) in sum.iter_mut().zip(mixed) {
+                        *sum += value;
+                    }
+                }
+            }
+        }
+        let share = 1.0 / (side * side) as f32;
+        Self::from_rows(width, height, |channel, y, row| {
+            for (value, sum) in row.iter_mut().zip(&sums[y * width..]) {
+                *value = share * sum[channel];
+            }
+        })
+    }
+
+    /// Columns and rows.
+    pub(super) fn size(&self) -> [usize; 2] {
+        [self.width, self.height]
+    }
+
+    /// Index of a pixel in a channel.
+    #[inline(always)]
+    pub(super) fn index(&self, x: usize, y: usize) -> usize {
+        (y + BORDER) * self.stride + x + BORDER
     }
 
     /// The values of one row of one channel, without the border.
@@ -48,42 +125,35 @@ impl Planes {
     }
 
     /// The channels without the border.
-    pub(super) fn interiors(&self) -> [Vec<f32>; 3] {
-        [0, 1, 2].map(|channel| (0..self.height).flat_map(|y| self.row(channel, y)).copied().collect())
+    pub(super) fn interiors(&self) -> [Vec<f32>; CHANNELS] {
+        std::array::from_fn(|channel| (0..self.height).flat_map(|y| self.row(channel, y)).copied().collect())
     }
 
     /// Half the size, each pixel the mean of four; an odd last row or column is replicated.
     pub(super) fn halved(&self) -> Self {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        let halve = |channel: &Vec<f32>| {
-            let mut half = Vec::with_capacity(width * height);
-            for y in 0..height {
-                let first = (2 * y + BORDER) * self.stride + BORDER;
-                let upper = &channel[first..first + 2 * width];
-                let lower = &channel[first + self.stride..first + self.stride + 2 * width];
-                let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
-                half.extend(pairs.map(|(a, b)| 0.25 * (a[0] + a[1] + b[0] + b[1])));
+        Self::from_rows(width, height, |channel, y, row| {
+            let (first, channel) = (self.index(0, 2 * y), &self.channels[channel]);
+            let upper = &channel[first..first + 2 * width];
+            let lower = &channel[first + self.stride..first + self.stride + 2 * width];
+            let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
+            for (value, (a, b)) in row.iter_mut().zip(pairs) {
+                *value = 0.25 * (a[0] + a[1] + b[0] + b[1]);
             }
-            half
-        };
-        Self::from_interiors(width, height, [0, 1, 2].map(|channel| halve(&self.channels[channel])))
+        })
     }
 
     /// Central differences along x and along y.
     pub(super) fn gradients(&self) -> [Self; 2] {
         [1, self.stride].map(|step| {
-            let interiors = [0, 1, 2].map(|channel| {
-                let values = &self.channels[channel];
-                let mut differences = Vec::with_capacity(self.width * self.height);
-                for y in 0..self.height {
-                    let first = (y + BORDER) * self.stride + BORDER;
-                    let ahead = &values[first + step..first + step + self.width];
-                    let behind = &values[first - step..first - step + self.width];
-                    differences.extend(ahead.iter().zip(behind).map(|(a, b)| 0.5 * (a - b)));
+            Self::from_rows(self.width, self.height, |channel, y, row| {
+                let (first, values) = (self.index(0, y), &self.channels[channel]);
+                let ahead = &values[first + step..first + step + self.width];
+                let behind = &values[first - step..first - step + self.width];
+                for ((value, a), b) in row.iter_mut().zip(ahead).zip(behind) {
+                    *value = 0.5 * (a - b);
                 }
-                differences
-            });
-            Self::from_interiors(self.width, self.height, interiors)
+            })
         })
     }
 
@@ -97,56 +167,16 @@ impl Planes {
         Self::from_interiors(self.width, self.height, interiors)
     }
 
-    /// The patch whose top-left pixel has index `(x, y)`.
-    pub(super) fn patch(&self, x: usize, y: usize) -> Patch {
-        let mut patch = [0.0; PATCH_VALUES];
-        for (channel, rows) in self.channels.iter().zip(patch.as_chunks_mut::<{ PATCH * PATCH }>().0) {
-            let mut first = (y + BORDER) * self.stride + x + BORDER;
-            for row in rows.as_chunks_mut::<PATCH>().0 {
-                row.copy_from_slice(&channel[first..first + PATCH]);
-                first += self.stride;
-            }
-        }
-        patch
-    }
-
-    /// The patch whose top-left pixel has the fractional index `(x, y)`, bilinear; far outside is the border.
-    pub(super) fn patch_at(&self, x: f32, y: f32) -> Patch {
-        let least = -(PATCH as f32 + 1.0);
-        // Shifting by the border makes the coordinates positive, so truncation is the floor.
-        let x = x.clamp(least, self.width as f32) + BORDER as f32;
-        let y = y.clamp(least, self.height as f32) + BORDER as f32;
-        let (column, row) = (x as usize, y as usize);
-        let (fx, fy) = (x - column as f32, y - row as f32);
-        let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-        let mut patch = [0.0; PATCH_VALUES];
-        for (channel, rows) in self.channels.iter().zip(patch.as_chunks_mut::<{ PATCH * PATCH }>().0) {
-            let mut first = row * self.stride + column;
-            for out in rows.as_chunks_mut::<PATCH>().0 {
-                let upper = &channel[first..first + PATCH + 1];
-                let lower = &channel[first + self.stride..first + self.stride + PATCH + 1];
-                for i in 0..PATCH {
-                    out[i] = weights[0] * upper[i]
-                        + weights[1] * upper[i + 1]
-                        + weights[2] * lower[i]
-                        + weights[3] * lower[i + 1];
-                }
-                first += self.stride;
-            }
-        }
-        patch
-    }
-
     /// The colour at fractional pixel index `(x, y)`, bilinear; outside is the border.
-    pub(super) fn colour_at(&self, x: f32, y: f32) -> [f32; 3] {
+    pub(super) fn colour_at(&self, x: f32, y: f32) -> [f32; CHANNELS] {
         let x = x.clamp(-1.0, self.width as f32) + BORDER as f32;
         let y = y.clamp(-1.0, self.height as f32) + BORDER as f32;
         let (column, row) = (x as usize, y as usize);
         let (fx, fy) = (x - column as f32, y - row as f32);
         let first = row * self.stride + column;
-        [0, 1, 2].map(|channel| {
-            let upper = &self.channels[channel][first..first + 2];
-            let lower = &self.channels[channel][first + self.stride..first + self.stride + 2];
+        self.channels.each_ref().map(|channel| {
+            let upper = &channel[first..first + 2];
+            let lower = &channel[first + self.stride..first + self.stride + 2];
             let above = upper[0] + fx * (upper[1] - upper[0]);
             let below = lower[0] + fx * (lower[1] - lower[0]);
             above + fy * (below - above)
@@ -156,7 +186,10 @@ impl Planes {
 
 /// The pyramid of one frame: level 0 first, each level half the size of the one before, down to at most
 /// `coarsest_side` pixels on the longer side.
-pub(super) fn pyramid(finest: Planes, coarsest_side: usize) -> Vec<Planes> {
+pub(super) fn pyramid<const CHANNELS: usize>(
+    finest: Planes<CHANNELS>,
+    coarsest_side: usize,
+) -> Vec<Planes<CHANNELS>> {
     let mut levels = vec![finest];
     loop {
         let coarsest = &levels[levels.len() - 1];
@@ -166,55 +199,6 @@ pub(super) fn pyramid(finest: Planes, coarsest_side: usize) -> Vec<Planes> {
         let next = coarsest.halved();
         levels.push(next);
     }
-}
-
-fn with_border(interior: &[f32], width: usize, height: usize) -> Vec<f32> {
-    let mut padded = Vec::with_capacity((width + 2 * BORDER) * (height + 2 * BORDER));
-    for y in 0..height + 2 * BORDER {
-        let source = y.saturating_sub(BORDER).min(height - 1);
-        let row = &interior[source * width..(source + 1) * width];
-        padded.extend(std::iter::repeat_n(row[0], BORDER));
-        padded.extend_from_slice(row);
-        padded.extend(std::iter::repeat_n(row[width - 1], BORDER));
-    }
-    padded
-}
-
-/// Sum over windows of `2 * radius + 1` columns and rows, cut at the image's edge.
-pub(super) fn box_sum(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
-    let mut columns = vec![0.0f32; width * height];
-    for y in 0..height {
-        let out = &mut columns[y * width..(y + 1) * width];
-        // Direct sums: a running sum would carry its rounding along and break exact symmetry.
-        for source in y.saturating_sub(radius)..(y + radius + 1).min(height) {
-            let row = &values[source * width..(source + 1) * width];
-            out.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
-        }
-    }
-    let mut sums = vec![0.0f32; width * height];
-    let mut padded = vec![0.0f32; width + 2 * radius];
-    for y in 0..height {
-        padded[radius..radius + width].copy_from_slice(&columns[y * width..(y + 1) * width]);
-        let out = &mut sums[y * width..(y + 1) * width];
-        for shift in 0..=2 * radius {
-            out.iter_mut().zip(&padded[shift..shift + width]).for_each(|(sum, value)| *sum += value);
-        }
-    }
-    sums
-}
-
-/// Number of pixels of each window of [`box_sum`].
-pub(super) fn box_counts(width: usize, height: usize, radius: usize) -> Vec<f32> {
-    let extent = |at: usize, size: usize| (at + radius + 1).min(size) - at.saturating_sub(radius);
-    let counts =
-        (0..height).flat_map(|y| (0..width).map(move |x| (extent(x, width) * extent(y, height)) as f32));
-    counts.collect()
-}
-
-/// Mean over windows of `2 * radius + 1` columns and rows, cut at the image's edge.
-pub(super) fn box_mean(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
-    let sums = box_sum(values, width, height, radius);
-    sums.iter().zip(&box_counts(width, height, radius)).map(|(sum, count)| sum / count).collect()
 }
 
 #[cfg(test)]
@@ -242,40 +226,12 @@ mod tests {
     fn sampling_agrees_with_double_precision_and_clamps_outside() {
         let planes = ramped(13, 9);
         for (x, y) in [(0.0f32, 0.0f32), (3.25, 4.75), (-4.5, 2.5), (11.9, 8.0), (-9.0, -9.0), (13.0, 9.0)] {
-            let patch = planes.patch_at(x, y);
-            for (i, &value) in patch.iter().enumerate() {
-                let (channel, row, column) = (i / 64, i / 8 % 8, i % 8);
-                let exact =
-                    bilinear(&planes, channel, f64::from(x) + column as f64, f64::from(y) + row as f64);
-                // Values up to 100 in f32: four roundings of 6e-8 relative, the weights another few.
-                assert!((f64::from(value) - exact).abs() < 1e-3, "{x} {y} {i}: {value} {exact}");
-            }
             let colour = planes.colour_at(x.clamp(-1.0, 13.0), y.clamp(-1.0, 9.0));
             let exact = bilinear(&planes, 2, f64::from(x.clamp(-1.0, 13.0)), f64::from(y.clamp(-1.0, 9.0)));
             assert!((f64::from(colour[2]) - exact).abs() < 1e-3);
         }
         for far in [f32::MAX, f32::MIN, f32::INFINITY, f32::NEG_INFINITY, 1e-40] {
-            assert!(
-                planes.patch_at(far, far).iter().chain(&planes.colour_at(far, far)).all(|v| v.is_finite())
-            );
-        }
-    }
-
-    #[test]
-    fn box_means_agree_with_direct_sums() {
-        let (width, height) = (7, 5);
-        let values: Vec<f32> = (0..width * height).map(|i| ((i * 13) % 17) as f32 - 8.0).collect();
-        for radius in [0, 1, 2, 6, 100] {
-            let means = box_mean(&values, width, height, radius);
-            for (i, &mean) in means.iter().enumerate() {
-                let inside = |j: &usize| {
-                    (j % width).abs_diff(i % width) <= radius && (j / width).abs_diff(i / width) <= radius
-                };
-                let members: Vec<f64> =
-                    (0..values.len()).filter(inside).map(|j| f64::from(values[j])).collect();
-                let exact = members.iter().sum::<f64>() / members.len() as f64;
-                assert!((f64::from(mean) - exact).abs() < 1e-5);
-            }
+            assert!(planes.colour_at(far, far).iter().all(|v| v.is_finite()));
         }
     }
 

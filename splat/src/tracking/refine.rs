@@ -1,21 +1,20 @@
 //! Variational refinement: robust colour constancy against edge-aware smoothness, linearised around the given flow.
 //! It fills untextured areas from their surroundings and takes the patch grid out of the flow.
 
-use super::{
-    TrackingSettings,
-    flow::Flow,
-    patches::Reference,
-    planes::{Planes, box_mean},
-};
+use super::{TrackingSettings, flow::Flow, pair::Level, planes::Planes, windows::average_windows};
+use crate::simd::{Instructions, Simd, simd_kernel};
 
 /// Residual at which the data term turns from quadratic to linear, 0 to 255 scale.
 const RESIDUAL_SCALE: f32 = 4.0;
-/// Flow difference between neighbours at which the smoothness turns from quadratic to linear, pixels.
-const DIFFERENCE_SCALE: f32 = 0.3;
+/// Flow difference between neighbours at which the smoothness turns from quadratic to linear, pixels: small where
+/// nothing moves, as what rests does so alike, and growing with the motion, as what moves turns and bends.
+const DIFFERENCE_AT_REST: f32 = 0.03;
+const DIFFERENCE_BY_MOTION: f32 = 0.1;
+const DIFFERENCE_AT_MOST: f32 = 0.3;
 /// Weight of staying: keeps pixels without neighbour or texture where they are.
 const HOLD: f32 = 1e-4;
-/// Colour difference between neighbours that halves their smoothness, 0 to 255 scale.
-const EDGE_SCALE: f32 = 40.0;
+/// Spectral radius of the sweeps that their acceleration expects.
+const SPECTRAL_RADIUS: f32 = 0.95;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
 const SHADING_RADIUS: usize = 4;
 
@@ -44,78 +43,271 @@ impl Smoothing {
 }
 
 /// Refines `flow` from `reference` to `target`; where `trust` is given and false, colour does not count.
-pub(super) fn refine(
-    reference: &Reference<'_>,
-    target: &Reference<'_>,
-    flow: &Flow,
+pub(super) fn refine<const C: usize>(
+    instructions: Instructions,
+    reference: &Level<C>,
+    target: &Level<C>,
+    mut flow: Flow,
     trust: Option<&[bool]>,
     smoothing: Smoothing,
 ) -> Flow {
     if smoothing.iterations == 0 {
-        return flow.clone();
+        return flow;
     }
-    let mut start = flow.clone();
     for _ in 0..smoothing.warps {
-        let equations = Equations::new(reference, target, &start, trust, smoothing);
-        start = equations.relaxed(&start, smoothing.iterations);
+        let linear = Linearised::new(instructions, reference, target, &flow);
+        let mut equations = Equations::zeros(flow.width, flow.height);
+        combine(instructions, &linear, trust, &mut equations);
+        let mut mean = vec![0.0; flow.u.len()];
+        for term in
+            [&mut equations.xx, &mut equations.xy, &mut equations.yy, &mut equations.x, &mut equations.y]
+        {
+            average_windows(
+                instructions,
+                term,
+                flow.width,
+                flow.height,
+                smoothing.window as usize,
+                &mut mean,
+            );
+            std::mem::swap(term, &mut mean);
+        }
+        link(instructions, &reference.similarity, &flow, smoothing.weight, &mut equations);
+        relax(instructions, &equations, smoothing.iterations, &mut flow);
     }
-    start
+    flow
 }
 
-/// `xx du + xy dv + x = 0`, `xy du + yy dv + y = 0` per pixel: the normal equations of the linearised residuals.
-struct DataTerm {
+/// What the target shows along the flow: difference from the reference, means removed, and gradients.
+struct Linearised<const C: usize> {
+    residual: [Vec<f32>; C],
+    along_x: [Vec<f32>; C],
+    along_y: [Vec<f32>; C],
+}
+
+impl<const C: usize> Linearised<C> {
+    fn new(instructions: Instructions, reference: &Level<C>, target: &Level<C>, flow: &Flow) -> Self {
+        let pixels = flow.u.len();
+        let zeros = || [(); C].map(|()| vec![0.0f32; pixels]);
+        let mut linear = Self { residual: zeros(), along_x: zeros(), along_y: zeros() };
+        warp(instructions, reference, target, flow, &mut linear);
+        let mut mean = vec![0.0; pixels];
+        for residual in &mut linear.residual {
+            average_windows(instructions, residual, flow.width, flow.height, SHADING_RADIUS, &mut mean);
+            residual.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= mean);
+        }
+        linear
+    }
+}
+
+simd_kernel! {
+    fn warp<const C: usize>(reference: &Level<C>, target: &Level<C>, flow: &Flow, linear: &mut Linearised<C>) = warp_kernel
+}
+
+#[inline(always)]
+fn warp_kernel<S: Simd, const C: usize>(
+    reference: &Level<C>,
+    target: &Level<C>,
+    flow: &Flow,
+    linear: &mut Linearised<C>,
+) {
+    for y in 0..flow.height {
+        for x in 0..flow.width {
+            let i = y * flow.width + x;
+            // The target's gradients: those of the reference are turned and sheared against it.
+            let sample = target.texels.sample(x as f32 + flow.u[i], y as f32 + flow.v[i]);
+            for (c, [value, along_x, along_y, _]) in sample.into_iter().enumerate() {
+                linear.residual[c][i] = value - reference.planes.channels[c][reference.planes.index(x, y)];
+                linear.along_x[c][i] = along_x;
+                linear.along_y[c][i] = along_y;
+            }
+        }
+    }
+}
+
+/// Per pixel two linear equations, coupled with the four neighbours:
+/// `xx u + xy v = x` and `xy u + yy v = y` plus the differences from the neighbours, weighted by the links.
+struct Equations {
+    width: usize,
     xx: Vec<f32>,
     xy: Vec<f32>,
     yy: Vec<f32>,
     x: Vec<f32>,
     y: Vec<f32>,
+    /// Smoothness weights of each pixel with its left and its upper neighbour; 0 across the image's edge. One more row
+    /// than the image: the weight with the right neighbour is the next entry, the lower one a row on.
+    left: Vec<f32>,
+    up: Vec<f32>,
 }
 
-impl DataTerm {
-    fn new(
-        reference: &Reference<'_>,
-        target: &Reference<'_>,
-        flow: &Flow,
-        trust: Option<&[bool]>,
-        window: usize,
-    ) -> Self {
-        let (width, height) = (flow.width, flow.height);
-        let residuals = residuals(reference.planes, target.planes, flow)
-            .map(|channel| subtract(&channel, &box_mean(&channel, width, height, SHADING_RADIUS)));
-        let mut term = Self {
-            xx: vec![0.0; width * height],
-            xy: vec![0.0; width * height],
-            yy: vec![0.0; width * height],
-            x: vec![0.0; width * height],
-            y: vec![0.0; width * height],
-        };
+impl Equations {
+    fn zeros(width: usize, height: usize) -> Self {
+        let zeros = || vec![0.0f32; width * height];
+        let links = || vec![0.0f32; width * (height + 1)];
+        Self {
+            width,
+            xx: zeros(),
+            xy: zeros(),
+            yy: zeros(),
+            x: zeros(),
+            y: zeros(),
+            left: links(),
+            up: links(),
+        }
+    }
+}
+
+simd_kernel! {
+    /// The normal equations of the linearised residuals, each pixel on its own.
+    fn combine<const C: usize>(linear: &Linearised<C>, trust: Option<&[bool]>, equations: &mut Equations) = combine_kernel
+}
+
+#[inline(always)]
+fn combine_kernel<S: Simd, const C: usize>(
+    linear: &Linearised<C>,
+    trust: Option<&[bool]>,
+    equations: &mut Equations,
+) {
+    let pixels = equations.xx.len();
+    let mut weights = vec![0.0f32; pixels];
+    for residual in &linear.residual {
+        for (weight, r) in weights.iter_mut().zip(residual) {
+            *weight += r * r * (1.0 / C as f32);
+        }
+    }
+    for weight in &mut weights {
+        *weight = 1.0 / (*weight + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt();
+    }
+    if let Some(trust) = trust {
+        for (weight, &trusted) in weights.iter_mut().zip(trust) {
+            *weight = if trusted { *weight } else { 0.0 };
+        }
+    }
+    for c in 0..C {
+        let (r, gx, gy) =
+            (&linear.residual[c][..pixels], &linear.along_x[c][..pixels], &linear.along_y[c][..pixels]);
+        let (xx, xy, yy) =
+            (&mut equations.xx[..pixels], &mut equations.xy[..pixels], &mut equations.yy[..pixels]);
+        let (x, y) = (&mut equations.x[..pixels], &mut equations.y[..pixels]);
+        // One channel of a colour image counts a third.
+        let share = 3.0 / C as f32;
+        for i in 0..pixels {
+            let (weighted_x, weighted_y) = (share * weights[i] * gx[i], share * weights[i] * gy[i]);
+            xx[i] += weighted_x * gx[i];
+            xy[i] += weighted_x * gy[i];
+            yy[i] += weighted_y * gy[i];
+            x[i] -= weighted_x * r[i];
+            y[i] -= weighted_y * r[i];
+        }
+    }
+}
+
+simd_kernel! {
+    /// Adds the smoothness to the equations and brings them to the form that sweeps use: `x` and `y` the constant
+    /// right-hand sides, `xx`, `xy`, `yy` the inverse of the pixel's matrix.
+    fn link(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, equations: &mut Equations) = link_kernel
+}
+
+#[inline(always)]
+fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, equations: &mut Equations) {
+    let (width, height) = (flow.width, flow.height);
+    let pixels = width * height;
+    let weight = weight * DIFFERENCE_AT_MOST;
+    for (links, step, similarity) in
+        [(&mut equations.left, 1, &similarity[0]), (&mut equations.up, width, &similarity[1])]
+    {
+        let count = pixels - step.min(pixels);
+        let links = &mut links[pixels - count..pixels];
+        let similarity = &similarity[pixels - count..pixels];
+        let (u, v) = (&flow.u[pixels - count..], &flow.v[pixels - count..]);
+        let (other_u, other_v) = (&flow.u[..count], &flow.v[..count]);
+        for i in 0..count {
+            let (du, dv) = (u[i] - other_u[i], v[i] - other_v[i]);
+            let speed = u[i] * u[i] + v[i] * v[i];
+            let scale =
+                DIFFERENCE_AT_REST * DIFFERENCE_AT_REST + DIFFERENCE_BY_MOTION * DIFFERENCE_BY_MOTION * speed;
+            let scale = scale.min(DIFFERENCE_AT_MOST * DIFFERENCE_AT_MOST);
+            links[i] = weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
+        }
+    }
+    let equations = &mut *equations;
+    let (left, up) = (&equations.left[..pixels], &equations.up[..pixels]);
+    let (right, down) = (&equations.left[1..1 + pixels], &equations.up[width..width + pixels]);
+    let (xx, xy, yy) =
+        (&mut equations.xx[..pixels], &mut equations.xy[..pixels], &mut equations.yy[..pixels]);
+    let (x, y) = (&mut equations.x[..pixels], &mut equations.y[..pixels]);
+    let (u, v) = (&flow.u[..pixels], &flow.v[..pixels]);
+    for i in 0..pixels {
+        x[i] += xx[i] * u[i] + xy[i] * v[i] + HOLD * u[i];
+        y[i] += xy[i] * u[i] + yy[i] * v[i] + HOLD * v[i];
+        let total = left[i] + up[i] + right[i] + down[i] + HOLD;
+        let (a, b, c) = (xx[i] + total, xy[i], yy[i] + total);
+        let inverse = 1.0 / (a * c - b * b);
+        xx[i] = c * inverse;
+        xy[i] = -b * inverse;
+        yy[i] = a * inverse;
+    }
+}
+
+simd_kernel! {
+    /// Jacobi sweeps, each pixel solving its equations with its neighbours held, with Chebyshev's acceleration (Golub
+    /// and Varga, 1961).
+    fn relax(equations: &Equations, sweeps: u32, flow: &mut Flow) = relax_kernel
+}
+
+#[inline(always)]
+fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, flow: &mut Flow) {
+    let (width, height) = (flow.width, flow.height);
+    // A row before and after, so that every neighbour exists; its links are 0.
+    let spare = vec![0.0; width];
+    let mut current = [[&spare[..], &flow.u, &spare].concat(), [&spare[..], &flow.v, &spare].concat()];
+    let mut next = current.clone();
+    let mut momentum = 1.0;
+    for sweep in 0..sweeps {
         for y in 0..height {
-            let line = y * width..(y + 1) * width;
-            let residual = [0, 1, 2].map(|channel: usize| &residuals[channel][line.clone()]);
-            let (xx, xy, yy) =
-                (&mut term.xx[line.clone()], &mut term.xy[line.clone()], &mut term.yy[line.clone()]);
-            let (right_x, right_y) = (&mut term.x[line.clone()], &mut term.y[line.clone()]);
-            for i in 0..width {
-                let r = [residual[0][i], residual[1][i], residual[2][i]];
-                // The target's gradients: those of the reference are turned and sheared against it.
-                let [u, v] = flow.at(i, y);
-                let [gx, gy] =
-                    target.gradients.each_ref().map(|planes| planes.colour_at(i as f32 + u, y as f32 + v));
-                let squares = (r[0] * r[0] + r[1] * r[1] + r[2] * r[2]) * (1.0 / 3.0);
-                let trusted = trust.is_none_or(|trust| trust[line.start + i]);
-                let weight =
-                    if trusted { 1.0 / (squares + RESIDUAL_SCALE * RESIDUAL_SCALE).sqrt() } else { 0.0 };
-                xx[i] = weight * (gx[0] * gx[0] + gx[1] * gx[1] + gx[2] * gx[2]);
-                xy[i] = weight * (gx[0] * gy[0] + gx[1] * gy[1] + gx[2] * gy[2]);
-                yy[i] = weight * (gy[0] * gy[0] + gy[1] * gy[1] + gy[2] * gy[2]);
-                right_x[i] = weight * (gx[0] * r[0] + gx[1] * r[1] + gx[2] * r[2]);
-                right_y[i] = weight * (gy[0] * r[0] + gy[1] * r[1] + gy[2] * r[2]);
-            }
+            sweep_row(equations, y, momentum, &current, &mut next);
         }
-        for values in [&mut term.xx, &mut term.xy, &mut term.yy, &mut term.x, &mut term.y] {
-            *values = box_mean(values, width, height, window);
-        }
-        term
+        let square = SPECTRAL_RADIUS * SPECTRAL_RADIUS;
+        momentum = 1.0 / (1.0 - if sweep == 0 { 0.5 * square } else { 0.25 * square * momentum });
+        std::mem::swap(&mut current, &mut next);
+    }
+    flow.u.copy_from_slice(&current[0][width..width * (height + 1)]);
+    flow.v.copy_from_slice(&current[1][width..width * (height + 1)]);
+}
+
+#[inline(always)]
+fn sweep_row(
+    equations: &Equations,
+    y: usize,
+    momentum: f32,
+    current: &[Vec<f32>; 2],
+    next: &mut [Vec<f32>; 2],
+) {
+    let width = equations.width;
+    let (first, centre) = (y * width, (y + 1) * width);
+    let line = first..first + width;
+    let (left, up) = (&equations.left[line.clone()], &equations.up[line.clone()]);
+    // The last row's last pixel has its right link at the start of the spare row.
+    let (right, down) = (&equations.left[first + 1..][..width], &equations.up[centre..][..width]);
+    let (xx, xy, yy) =
+        (&equations.xx[line.clone()], &equations.xy[line.clone()], &equations.yy[line.clone()]);
+    let (x, y) = (&equations.x[line.clone()], &equations.y[line]);
+    let [u, v] = current;
+    let (u_left, v_left) = (&u[centre - 1..][..width], &v[centre - 1..][..width]);
+    let (u_up, v_up) = (&u[first..][..width], &v[first..][..width]);
+    let (u_right, v_right) = (&u[centre + 1..][..width], &v[centre + 1..][..width]);
+    let (u_down, v_down) = (&u[centre + width..][..width], &v[centre + width..][..width]);
+    let [next_u, next_v] = next;
+    let (next_u, next_v) = (&mut next_u[centre..][..width], &mut next_v[centre..][..width]);
+    for i in 0..width {
+        let pull_u =
+            left[i] * u_left[i] + up[i] * u_up[i] + right[i] * u_right[i] + down[i] * u_down[i] + x[i];
+        let pull_v =
+            left[i] * v_left[i] + up[i] * v_up[i] + right[i] * v_right[i] + down[i] * v_down[i] + y[i];
+        let (solved_u, solved_v) = (xx[i] * pull_u + xy[i] * pull_v, xy[i] * pull_u + yy[i] * pull_v);
+        // `next` holds the values before the current ones.
+        next_u[i] += momentum * (solved_u - next_u[i]);
+        next_v[i] += momentum * (solved_v - next_v[i]);
     }
 }
 
@@ -134,118 +326,4 @@ pub(super) fn residuals(reference: &Planes, target: &Planes, flow: &Flow) -> [Ve
         }
     }
     residuals
-}
-
-fn subtract(a: &[f32], b: &[f32]) -> Vec<f32> {
-    a.iter().zip(b).map(|(a, b)| a - b).collect()
-}
-
-/// Smoothness weights of each pixel with its left and its upper neighbour; 0 across the image's edge. One more column
-/// and row than the image, so that the weight with the right neighbour is the next entry, the lower one a row on.
-struct Links {
-    left: Vec<f32>,
-    up: Vec<f32>,
-}
-
-impl Links {
-    fn new(planes: &Planes, flow: &Flow, weight: f32) -> Self {
-        let (width, height) = (flow.width, flow.height);
-        let link = |i: usize, j: usize, colour_difference: f32| {
-            let (du, dv) = (flow.u[i] - flow.u[j], flow.v[i] - flow.v[j]);
-            let edge = 1.0 + colour_difference / (EDGE_SCALE * EDGE_SCALE);
-            weight / (edge * ((du * du + dv * dv) / (DIFFERENCE_SCALE * DIFFERENCE_SCALE) + 1.0).sqrt())
-        };
-        let mut links = Self { left: vec![0.0; width * (height + 1)], up: vec![0.0; width * (height + 1)] };
-        for y in 0..height {
-            let rows = [0, 1, 2].map(|channel| planes.row(channel, y));
-            let above = [0, 1, 2].map(|channel| planes.row(channel, y.saturating_sub(1)));
-            for x in 0..width {
-                let i = y * width + x;
-                let difference = |other: [&[f32]; 3], at: usize| {
-                    let off = [0, 1, 2].map(|channel: usize| rows[channel][x] - other[channel][at]);
-                    (off[0] * off[0] + off[1] * off[1] + off[2] * off[2]) / 3.0
-                };
-                if x > 0 {
-                    links.left[i] = link(i, i - 1, difference(rows, x - 1));
-                }
-                if y > 0 {
-                    links.up[i] = link(i, i - width, difference(above, x));
-                }
-            }
-        }
-        links
-    }
-}
-
-/// Per pixel two linear equations, coupled with the four neighbours.
-struct Equations {
-    data: DataTerm,
-    links: Links,
-    /// Constant right-hand sides.
-    right: Flow,
-}
-
-impl Equations {
-    fn new(
-        reference: &Reference<'_>,
-        target: &Reference<'_>,
-        start: &Flow,
-        trust: Option<&[bool]>,
-        smoothing: Smoothing,
-    ) -> Self {
-        let data = DataTerm::new(reference, target, start, trust, smoothing.window as usize);
-        let links = Links::new(reference.planes, start, smoothing.weight);
-        let (width, height) = (start.width, start.height);
-        let mut right = Flow::zeros(width, height);
-        for i in 0..width * height {
-            let (u0, v0) = (start.u[i], start.v[i]);
-            right.u[i] = data.xx[i] * u0 + data.xy[i] * v0 - data.x[i] + HOLD * u0;
-            right.v[i] = data.xy[i] * u0 + data.yy[i] * v0 - data.y[i] + HOLD * v0;
-        }
-        Self { data, links, right }
-    }
-
-    /// Jacobi sweeps: each pixel solves its equations with its neighbours held.
-    fn relaxed(&self, start: &Flow, sweeps: u32) -> Flow {
-        let (width, height) = (start.width, start.height);
-        // A row before and after, so that every neighbour exists; its links are 0.
-        let padded = |axis: &[f32]| [&vec![0.0; width], axis, &vec![0.0; width]].concat();
-        let mut current = [padded(&start.u), padded(&start.v)];
-        let mut next = current.clone();
-        for _ in 0..sweeps {
-            for y in 0..height {
-                self.sweep_row(y, width, &current, &mut next);
-            }
-            std::mem::swap(&mut current, &mut next);
-        }
-        let [u, v] = current.map(|axis| axis[width..width * (height + 1)].to_vec());
-        Flow { width, height, u, v }
-    }
-
-    fn sweep_row(&self, y: usize, width: usize, current: &[Vec<f32>; 2], next: &mut [Vec<f32>; 2]) {
-        let (first, centre) = (y * width, (y + 1) * width);
-        let slice = |from: usize| from..from + width;
-        let (left, up) = (&self.links.left[slice(first)], &self.links.up[slice(first)]);
-        // The last row's last pixel has its right link at the start of the spare row.
-        let (right, down) = (&self.links.left[slice(first + 1)], &self.links.up[slice(first + width)]);
-        let data = &self.data;
-        let (xx, xy, yy) = (&data.xx[slice(first)], &data.xy[slice(first)], &data.yy[slice(first)]);
-        let (right_u, right_v) = (&self.right.u[slice(first)], &self.right.v[slice(first)]);
-        let [u, v] = current.each_ref().map(|values| {
-            [centre - 1, centre - width, centre + 1, centre + width].map(|from| &values[slice(from)])
-        });
-        let [next_u, next_v] = next;
-        let (next_u, next_v) = (&mut next_u[slice(centre)], &mut next_v[slice(centre)]);
-        for i in 0..width {
-            let total = left[i] + up[i] + right[i] + down[i] + HOLD;
-            let pull_u =
-                left[i] * u[0][i] + up[i] * u[1][i] + right[i] * u[2][i] + down[i] * u[3][i] + right_u[i];
-            let pull_v =
-                left[i] * v[0][i] + up[i] * v[1][i] + right[i] * v[2][i] + down[i] * v[3][i] + right_v[i];
-            let (a, b, c) = (xx[i] + total, xy[i], yy[i] + total);
-            let inverse = 1.0 / (a * c - b * b);
-            next_u[i] = (c * pull_u - b * pull_v) * inverse;
-            next_v[i] = (a * pull_v - b * pull_u) * inverse;
-        }
-    }
 }

@@ -12,19 +12,24 @@ pub struct TrackingSettings {
     /// Images are halved until their longer side is at most this many pixels; 16 and up, default 800.
     pub max_side: u32,
     /// Images of the exhaustive search are halved until their longer side is at most this many pixels; 16 to 256,
-    /// default 100. Its time grows with the fourth power.
+    /// default 100. Its time grows with the fourth power; 48 in the draft preset.
     pub search_side: u32,
     /// Largest displacement between two frames that the exhaustive search finds, as a fraction of the width; 0 to 1,
     /// default 0.4.
     pub search_radius: f32,
+    /// Whether colour is matched instead of brightness alone: surer, and slower; default true. The exhaustive search
+    /// always sees colour.
+    pub colour: bool,
     /// Distances in frames over which tracks are chained besides the direct match with the key frame; each at least
     /// 1, default 1 and 2.
     pub gaps: Vec<u32>,
+    /// Levels whose longer side has more pixels than this are refined without matching patches; default 400.
+    pub patch_side: u32,
     /// Distance of neighbouring patches, pixels; 1 to 8, default 3.
     pub patch_stride: u32,
     /// Descent steps per patch and level; 1 and up, default 12.
     pub patch_iterations: u32,
-    /// Weight of smoothness against colour constancy; 0 and up, default 150.
+    /// Weight of smoothness against colour constancy; 0 and up, default 100.
     pub smoothness: f32,
     /// Linearisations of the variational refinement per level; 0 (off) and up, default 2.
     pub smoothing_warps: u32,
@@ -57,10 +62,12 @@ impl TrackingSettings {
             max_side: 800,
             search_side: 100,
             search_radius: 0.4,
+            colour: true,
             gaps: vec![1, 2],
+            patch_side: 400,
             patch_stride: 3,
             patch_iterations: 12,
-            smoothness: 150.0,
+            smoothness: 100.0,
             smoothing_warps: 2,
             smoothing_window: 3,
             smoothing_iterations: 10,
@@ -73,19 +80,23 @@ impl TrackingSettings {
         match quality {
             Quality::Draft => Self {
                 max_side: 400,
-                search_side: 80,
+                search_side: 48,
+                colour: false,
                 gaps: vec![1],
+                patch_side: 200,
                 patch_stride: 4,
                 patch_iterations: 8,
+                smoothing_warps: 1,
                 ..balanced
             },
             Quality::Balanced => balanced,
             Quality::Best => Self {
                 max_side: 1600,
                 gaps: vec![1, 2, 4, 8],
+                patch_side: 1600,
                 patch_stride: 2,
                 patch_iterations: 16,
-                smoothing_iterations: 20,
+                smoothing_warps: 3,
                 ..balanced
             },
         }

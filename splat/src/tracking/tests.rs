@@ -9,6 +9,8 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 use crate::{image::Image, settings::Quality};
 
+mod pair;
+
 /// Smooth colour noise over the plane: band-limited enough that bilinear interpolation errs by a few grey levels.
 #[derive(Clone)]
 struct Texture {
@@ -360,7 +362,7 @@ fn tiny_images_and_broken_values_give_finite_tracks() {
 fn extreme_settings_give_finite_tracks() {
     let texture = Texture::new(9, 5.0);
     let frames = [0.0, 2.0, 4.0].map(|shift| render(64, 48, |x, y| texture.at(x - shift, y)));
-    let all_zero = r#"{"max_side":0,"search_side":0,"search_radius":0,"gaps":[0],"patch_stride":0,
+    let all_zero = r#"{"max_side":0,"search_side":0,"search_radius":0,"colour":false,"gaps":[0],"patch_side":0,"patch_stride":0,
         "patch_iterations":0,"smoothness":0,"smoothing_warps":0,"smoothing_window":0,"smoothing_iterations":0,
         "consistency":0,"correlation":0,"sigma_floor":0.01,"hidden_sigma":0}"#;
     track(&frames, &serde_json::from_str(all_zero).unwrap());

@@ -175,7 +175,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
     fn direct(&self, frame: &Frame, guess: Option<&Judged>) -> Result<Judged, M::Error> {
         let back: Option<Flow> = guess.map(chain::inverted);
         let guides = match (guess, &back) {
-            (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward }),
+            (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward, scale: 1.0 }),
             _ => None,
         };
         let Ways { forward, backward } = self.matcher.both_ways(&self.key, frame, guides, self.settings)?;
@@ -195,13 +195,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
     fn field(&self, tracks: &Judged) -> TrackField {
         let (width, height) = (self.width as usize, self.height as usize);
         let flow = &tracks.flow;
-        // Every halving rounds up, so the scale is the power of two, not the ratio of the sizes.
-        let mut scale = 1.0;
-        while (width as f32 / scale).ceil() as usize > flow.width
-            || (height as f32 / scale).ceil() as usize > flow.height
-        {
-            scale *= 2.0;
-        }
+        let scale = Flow::reduction([width, height], [flow.width, flow.height]);
         let mut field = TrackField {
             width: self.width,
             height: self.height,

@@ -45,7 +45,7 @@ pub(super) fn track_view<E: From<LearnedError>>(
 
 impl LearnedTracker {
     fn input(&self, image: &Image) -> Result<Input, LearnedError> {
-        let channels = Planes::from_image(image).interiors();
+        let channels = Planes::from_image(image, 0).interiors();
         self.network.input(image.width as usize, image.height as usize, &channels)
     }
 }

@@ -1,0 +1,110 @@
+//! The flow between two images, for use on its own.
+
+use super::{
+    TrackingSettings,
+    flow::Flow,
+    pair::{Guides, Pyramid, match_pyramids},
+};
+use crate::{image::Image, simd::Instructions};
+
+/// How far each pixel of one image has moved in another.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DenseFlow {
+    /// Columns of the images.
+    pub width: u32,
+    /// Rows of the images.
+    pub height: u32,
+    /// Displacement `x, y` of every pixel, row by row, in pixels.
+    pub displacement: Vec<[f32; 2]>,
+}
+
+impl DenseFlow {
+    fn planar(&self) -> Flow {
+        let axis = |axis: usize| self.displacement.iter().map(|displacement| displacement[axis]).collect();
+        Flow { width: self.width as usize, height: self.height as usize, u: axis(0), v: axis(1) }
+    }
+}
+
+/// The flow from the first to the second of two images, and the flow back.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PairFlow {
+    /// Displacements of the first image's pixels.
+    pub forward: DenseFlow,
+    /// Displacements of the second image's pixels.
+    pub backward: DenseFlow,
+}
+
+/// The images, or the initial flow, have different sizes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "a flow between {} x {} and {} x {} pixels; give images and initial flows of one size",
+    first.0, first.1, second.0, second.1
+)]
+pub struct SizesDiffer {
+    /// Columns and rows of the first image.
+    pub first: (u32, u32),
+    /// Columns and rows of what differs from it.
+    pub second: (u32, u32),
+}
+
+/// Matches two images both ways.
+///
+/// `initial` is what is known of the flow beforehand: it competes with what the images suggest. Displacements are
+/// finite whatever the images hold, and zero between identical images.
+pub fn pair_flow(
+    first: &Image,
+    second: &Image,
+    initial: Option<&PairFlow>,
+    settings: &TrackingSettings,
+) -> Result<PairFlow, SizesDiffer> {
+    let size = (first.width, first.height);
+    let flows = initial.iter().flat_map(|initial| [&initial.forward, &initial.backward]);
+    let sizes =
+        std::iter::once((second.width, second.height)).chain(flows.map(|flow| (flow.width, flow.height)));
+    for second in sizes {
+        if second != size {
+            return Err(SizesDiffer { first: size, second });
+        }
+    }
+    if first.pixel_count() == 0 {
+        let nothing = DenseFlow { width: size.0, height: size.1, displacement: Vec::new() };
+        return Ok(PairFlow { forward: nothing.clone(), backward: nothing });
+    }
+    let instructions = Instructions::detect();
+    let (first, second) = rayon::join(|| Pyramid::new(first, settings), || Pyramid::new(second, settings));
+    let initial = initial.map(|initial| (initial.forward.planar(), initial.backward.planar()));
+    let scale = Flow::reduction([size.0 as usize, size.1 as usize], first.size());
+    let guides = initial.as_ref().map(|(forward, backward)| Guides { forward, backward, scale: 1.0 / scale });
+    let (forward, backward) = match_pyramids(instructions, &first, &second, guides, settings);
+    let [forward, backward] = [forward, backward].map(|flow| enlarged(&flow, size, scale));
+    Ok(PairFlow { forward, backward })
+}
+
+/// The flow at the resolution of the images, `scale` times that of the field; bilinear.
+fn enlarged(flow: &Flow, (width, height): (u32, u32), scale: f32) -> DenseFlow {
+    let along = |at: u32, size: usize| {
+        let at = ((at as f32 + 0.5) / scale - 0.5).clamp(0.0, (size - 1) as f32);
+        let low = at as usize;
+        (low, (low + 1).min(size - 1), at - low as f32)
+    };
+    let columns: Vec<_> = (0..width).map(|x| along(x, flow.width)).collect();
+    let mut displacement = Vec::with_capacity(width as usize * height as usize);
+    let mut line = [(); 2].map(|()| vec![0.0f32; flow.width]);
+    for y in 0..height {
+        let (upper, lower, share) = along(y, flow.height);
+        for (line, axis) in line.iter_mut().zip([&flow.u, &flow.v]) {
+            let upper = &axis[upper * flow.width..(upper + 1) * flow.width];
+            let lower = &axis[lower * flow.width..(lower + 1) * flow.width];
+            for ((value, upper), lower) in line.iter_mut().zip(upper).zip(lower) {
+                let blend = scale * (upper + share * (lower - upper));
+                // Only settings without sense give anything else.
+                *value = if blend.is_finite() { blend } else { 0.0 };
+            }
+        }
+        let [u, v] = &line;
+        displacement.extend(columns.iter().map(|&(left, right, share)| {
+            [u[left] + share * (u[right] - u[left]), v[left] + share * (v[right] - v[left])]
+        }));
+    }
+    DenseFlow { width, height, displacement }
+}
