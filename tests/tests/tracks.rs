@@ -66,12 +66,13 @@ fn tracks_are_written_pictured_and_measure_the_same_from_the_file() {
 
 #[test]
 fn one_view_goes_to_one_file_and_a_table_is_printed() {
-    let clip = clips::scratch(2, 1);
+    let clip = clips::scratch(2, 2);
     let clip = text(clip.path());
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("any.npz");
-    succeeds(&[&["track", clip, "--out", text(&file), "--quiet"], &QUICK[..]].concat());
-    let table = succeeds(&["eval-tracks", clip, "--tracks", text(&file), "--quiet"]);
+    let one_view = ["--views", "cam00", "--quiet"];
+    succeeds(&[&["track", clip, "--out", text(&file)], &one_view[..], &QUICK[..]].concat());
+    let table = succeeds(&[&["eval-tracks", clip, "--tracks", text(&file)], &one_view[..]].concat());
     for word in ["EPE px", "moving", "precision", "68.3 %", "decile"] {
         assert!(table.contains(word), "{word} in:\n{table}");
     }

@@ -86,7 +86,7 @@ mod tests {
     #[test]
     fn heat_has_ends() {
         assert_eq!((heat(-1.0), heat(0.0)), (HEAT[0], HEAT[0]));
-        assert_eq!((heat(1.0), heat(f32::INFINITY)), (HEAT[4], HEAT[4]));
+        assert!(near(heat(1.0), HEAT[4]) && heat(f32::INFINITY) == heat(1.0));
         assert!(near(heat(0.25), HEAT[1]));
         assert!(heat(f32::NAN).iter().all(|value| value.is_finite()));
     }
