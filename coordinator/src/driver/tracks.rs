@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 
+use prost::Message;
 use splat::settings::MotionSource;
 use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
@@ -64,12 +65,12 @@ impl Job {
         let settings_json = serde_json::to_string(&self.settings.tracking).map_err(|error| {
             StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
         })?;
+        let tracker = Tracker { settings_json };
         let mut tracked = BTreeMap::new();
         let views = self.views().await?;
         for (position, view) in (0..).zip(&views).filter(|(_, view)| !view.held_out) {
-            tracked.insert(position, self.tracked_view(position, view, &settings_json).await?);
+            tracked.insert(position, self.tracked_view(position, view, &tracker).await?);
         }
-        let tracker = Tracker { settings_json };
         Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, tracked))
     }
 
@@ -77,7 +78,7 @@ impl Job {
         &self,
         position: u32,
         view: &ViewRecord,
-        tracker: &str,
+        tracker: &Tracker,
     ) -> Result<TrackedView, StageError> {
         let images = self.hub.store.images_of_view(&self.id, position).await?;
         let mut images = images.into_iter();
@@ -86,6 +87,7 @@ impl Job {
             StageError::new(FailureKind::Transient, message)
         })?;
         let mut fields = Vec::new();
+        let tracker = blake3::hash(&tracker.encode_to_vec()).to_hex().to_string();
         let mut own_key = digest_of(&("tracks", VERSION, tracker, &key_image.digest));
         for (index, (frame, image)) in (1..).zip(images) {
             let key = match self.request.tracks {
