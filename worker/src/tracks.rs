@@ -152,7 +152,7 @@ impl Tracking {
             .retry(self.backoff)
             .when(|error| error.kind() == FailureKind::Transient)
             .notify(|error, delay| tracing::debug!(%error, ?delay, "a transfer failed and is tried again"));
-        let retried = self.cancel.run_until_cancelled(async { retried.await });
+        let retried = self.cancel.run_until_cancelled(retried);
         let ended = self.runtime.block_on(retried).ok_or(Stop::Cancelled)?;
         ended.map_err(|error| JobError::from(error).into())
     }
