@@ -22,7 +22,7 @@ pub struct ServeOptions {
     pub lease_duration: Duration,
     /// A lease whose stream broke waits this long for its worker to come back, at most `lease_duration`.
     pub reconnect_grace: Duration,
-    /// Failed attempts that a frame may have, at least 1.
+    /// Failed attempts that a frame, or the tracks of a view, may have; at least 1.
     pub max_attempts: u32,
     /// Embedded mode: no other workers will ever join. They are dismissed when the last job has ended, and a frame
     /// that none of them has the resources for fails instead of waiting.

@@ -39,7 +39,7 @@ pub(crate) struct CoordinatorArgs {
     #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Leases")]
     reconnect_grace: Option<Duration>,
 
-    /// Failed attempts that a frame may have.
+    /// Failed attempts that a frame, or the tracks of a view, may have.
     #[arg(long, value_name = "N", default_value_t = 3, help_heading = "Leases")]
     max_attempts: u32,
 

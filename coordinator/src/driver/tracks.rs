@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 
+use prost::Message;
 use splat::settings::MotionSource;
 use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
@@ -65,20 +66,19 @@ impl Job {
         let settings_json = serde_json::to_string(&self.settings.tracking).map_err(|error| {
             StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
         })?;
-        let (tracker, tracker_key) = match &self.request.tracks {
+        let tracker = match &self.request.tracks {
             TrackSource::Learned(file) => {
-                let key = digest_of(&(&settings_json, &file.digest));
                 let model = Some(self.model_blob(file).await?);
-                (Tracker { settings_json, model, model_name: file.name().to_owned() }, key)
+                Tracker { settings_json, model, model_name: file.name().to_owned() }
             }
             TrackSource::Own | TrackSource::Exact(_) | TrackSource::Files(_) => {
-                (Tracker { settings_json: settings_json.clone(), ..Tracker::default() }, settings_json)
+                Tracker { settings_json, ..Tracker::default() }
             }
         };
         let mut tracked = BTreeMap::new();
         let views = self.views().await?;
         for (position, view) in (0..).zip(&views).filter(|(_, view)| !view.held_out) {
-            tracked.insert(position, self.tracked_view(position, view, &tracker_key).await?);
+            tracked.insert(position, self.tracked_view(position, view, &tracker).await?);
         }
         Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, tracked))
     }
@@ -103,7 +103,7 @@ impl Job {
         &self,
         position: u32,
         view: &ViewRecord,
-        tracker: &str,
+        tracker: &Tracker,
     ) -> Result<TrackedView, StageError> {
         let images = self.hub.store.images_of_view(&self.id, position).await?;
         let mut images = images.into_iter();
@@ -112,6 +112,9 @@ impl Job {
             StageError::new(FailureKind::Transient, message)
         })?;
         let mut fields = Vec::new();
+        // A network is known by its bytes, whatever its file is called.
+        let nameless = Tracker { model_name: String::new(), ..tracker.clone() };
+        let tracker = blake3::hash(&nameless.encode_to_vec()).to_hex().to_string();
         let mut own_key = digest_of(&("tracks", VERSION, tracker, &key_image.digest));
         for (index, (frame, image)) in (1..).zip(images) {
             let key = match self.request.tracks {
