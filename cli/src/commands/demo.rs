@@ -38,6 +38,7 @@ pub(super) async fn run(args: DemoArgs, logs: &LogArgs) -> Result<(), CliError> 
         test_views: Vec::new(),
         static_model: None,
         tracks: Vec::new(),
+        tracker: None,
         settings: args.settings,
     };
     let request = job.request(Some(&args.out))?;
