@@ -79,7 +79,8 @@ fn same_as_plain<S: Simd>() {
     }
     assert_eq!(lanes(S::row_sums(f)), lanes(Plain::row_sums(g)));
     run("negated_mul_add", s.negated_mul_add(t, s), p.negated_mul_add(q, p));
-    let (low, high) = (a.first_chunk().unwrap(), b.last_chunk().unwrap());
+    let low = a.first_chunk().expect("half of the lanes");
+    let high = b.last_chunk().expect("half of the lanes");
     assert_eq!(lanes(S::load_halves([low, high]))[6..10], [a[6], a[7], b[8], b[9]]);
     let (mut first, mut second) = ([0.0; LANES / 2], [0.0; LANES / 2]);
     s.store_halves([&mut first, &mut second]);

@@ -74,7 +74,7 @@ fn samples_agree_with_double_precision_and_clamp_outside() {
 #[test]
 fn descent_finds_a_known_shift_on_every_instruction_set() {
     let shift = [1.3f32, -0.6];
-    let first = render(64, 48, |x, y| waves(x, y));
+    let first = render(64, 48, waves);
     let second = render(64, 48, |x, y| waves(x - shift[0], y - shift[1]));
     let (first, second) = (Planes::luma_of(&first, 0), Planes::luma_of(&second, 0));
     let mut fields = Vec::new();
@@ -131,7 +131,7 @@ fn refinement_finds_a_known_affine_field() {
         let (x, y, determinant) = (x - 0.8, y + 0.5, a * d - b * c);
         [(d * x - b * y) / determinant, (a * y - c * x) / determinant]
     };
-    let first = finest_level(&render(72, 56, |x, y| waves(x, y)));
+    let first = finest_level(&render(72, 56, waves));
     let second = finest_level(&render(72, 56, |x, y| {
         let [x, y] = back(x, y);
         waves(x, y)
