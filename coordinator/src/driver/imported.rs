@@ -135,17 +135,21 @@ impl ImportRun {
     fn run(&self, view: &MissingView) -> Result<(), StageError> {
         let path = Path::new(&view.file.path);
         let is_exact = path == self.clip.exact_flow_path(view.position);
-        let read =
-            if is_exact { track_npz::read_exact_flow(path) } else { track_npz::read_tracks(path, view.size) };
+        let opened = match is_exact {
+            true => track_npz::open_exact_flow(path),
+            false => track_npz::open_tracks(path, view.size),
+        };
         // After reading: what was read is what is kept under the key of the submitted file.
         check_unchanged(view)?;
-        let fields = read.map_err(|error| bad_tracks(view, error))?;
-        let fields = match is_exact {
-            true => exact_fields(view, &self.frames, fields)?,
-            false => imported_fields(view, self.frames.len(), fields)?,
+        let tracks = opened.map_err(|error| bad_tracks(view, error))?;
+        let wanted = match is_exact {
+            true => exact_indices(view, &self.frames, tracks.count())?,
+            false => imported_indices(view, self.frames.len(), tracks.count())?,
         };
+        check_size(view, tracks.size())?;
         let keys = self.keys.get(&view.position).map(Vec::as_slice).unwrap_or_default();
-        keys.iter().zip(&fields).try_for_each(|(key, field)| self.emit(key, field))
+        let fields = wanted.into_iter().filter_map(|index| tracks.field(index));
+        keys.iter().zip(fields).try_for_each(|(key, field)| self.emit(key, &field))
     }
 
     /// Runs on a thread of the compute pool: waiting for the store is how the store slows the conversion down.
@@ -174,12 +178,8 @@ fn bad_tracks(view: &MissingView, reason: impl std::fmt::Display) -> StageError 
     StageError::bad_input(format!("tracks of view '{}' in {}: {reason}", view.name, view.file.path))
 }
 
-/// Exact flow leads from the clip's frame 1 to frame `t` at index `t - 2`.
-fn exact_fields(
-    view: &MissingView,
-    frames: &[u32],
-    mut fields: Vec<TrackField>,
-) -> Result<Vec<TrackField>, StageError> {
+/// Which of `held` fields of exact flow the frames take: flow leads from the clip's frame 1 to frame `t` at index `t - 2`.
+fn exact_indices(view: &MissingView, frames: &[u32], held: usize) -> Result<Vec<usize>, StageError> {
     if frames.first() != Some(&1) {
         let key_frame = frames.first().copied().unwrap_or_default();
         return Err(bad_tracks(
@@ -189,53 +189,36 @@ fn exact_fields(
             ),
         ));
     }
-    let held = fields.len();
     let last = frames.last().copied().unwrap_or_default() as usize;
     if held + 1 < last {
         let reason =
             format!("it reaches frame {}, the job needs frame {last}; reconstruct fewer frames", held + 1);
         return Err(bad_tracks(view, reason));
     }
-    let wanted: Vec<usize> = frames[1..].iter().map(|&frame| frame as usize - 2).collect();
-    let mut index = 0;
-    fields.retain(|_| {
-        index += 1;
-        wanted.binary_search(&(index - 1)).is_ok()
-    });
-    check_size(view, &fields)?;
-    Ok(fields)
+    Ok(frames[1..].iter().map(|&frame| frame as usize - 2).collect())
 }
 
-/// Imported tracks hold a field for every frame after the key frame, or for more.
-fn imported_fields(
-    view: &MissingView,
-    frames: usize,
-    mut fields: Vec<TrackField>,
-) -> Result<Vec<TrackField>, StageError> {
+/// Which of `held` imported fields are taken: there is one for every frame after the key frame, or for more.
+fn imported_indices(view: &MissingView, frames: usize, held: usize) -> Result<Vec<usize>, StageError> {
     let wanted = frames - 1;
-    if fields.len() < wanted {
+    if held < wanted {
         let reason = format!(
-            "it reaches {} frames beyond the key frame, the job needs {wanted}; reconstruct fewer frames",
-            fields.len()
+            "it reaches {held} frames beyond the key frame, the job needs {wanted}; reconstruct fewer frames"
         );
         return Err(bad_tracks(view, reason));
     }
-    fields.truncate(wanted);
-    check_size(view, &fields)?;
-    Ok(fields)
+    Ok((0..wanted).collect())
 }
 
-fn check_size(view: &MissingView, fields: &[TrackField]) -> Result<(), StageError> {
-    let wrong = fields.iter().find(|field| (field.width, field.height) != view.size);
-    wrong.map_or(Ok(()), |field| {
-        Err(bad_tracks(
-            view,
-            format!(
-                "they are of {} x {} pixels, the view of {} x {}; give tracks at the size of the images",
-                field.width, field.height, view.size.0, view.size.1
-            ),
-        ))
-    })
+fn check_size(view: &MissingView, size: (u32, u32)) -> Result<(), StageError> {
+    if size == view.size {
+        return Ok(());
+    }
+    let reason = format!(
+        "they are of {} x {} pixels, the view of {} x {}; give tracks at the size of the images",
+        size.0, size.1, view.size.0, view.size.1
+    );
+    Err(bad_tracks(view, reason))
 }
 
 #[cfg(test)]
@@ -249,17 +232,7 @@ mod tests {
         MissingView { position: 0, name: "cam00".into(), size: (2, 1), file }
     }
 
-    fn field(x: f32) -> TrackField {
-        TrackField {
-            width: 2,
-            height: 1,
-            positions: vec![[x, 0.0]; 2],
-            visible: vec![true; 2],
-            sigma: vec![0.1; 2],
-        }
-    }
-
-    fn refusal(result: Result<Vec<TrackField>, StageError>) -> String {
+    fn refusal<T: std::fmt::Debug>(result: Result<T, StageError>) -> String {
         let Err(StageError::Failed(failure)) = result else { panic!("{result:?}") };
         assert_eq!(failure.kind(), FailureKind::BadInput);
         assert!(failure.message.contains("cam00") && failure.message.contains("flow/cam00.npz"));
@@ -276,35 +249,31 @@ mod tests {
         let view = MissingView { file: submitted, ..view() };
         check_unchanged(&view).unwrap();
         std::fs::write(&path, b"changed").unwrap();
-        let message = refusal(check_unchanged(&view).map(|()| vec![]));
+        let message = refusal(check_unchanged(&view));
         assert!(message.contains("has changed"), "{message}");
         std::fs::remove_file(&path).unwrap();
-        refusal(check_unchanged(&view).map(|()| vec![]));
+        refusal(check_unchanged(&view));
     }
 
     #[test]
     fn exact_flow_is_taken_by_frame_number() {
-        let fields = || vec![field(2.0), field(3.0), field(4.0)];
-        let taken = exact_fields(&view(), &[1, 2, 4], fields()).unwrap();
-        assert_eq!(taken, [field(2.0), field(4.0)]);
-        assert!(refusal(exact_fields(&view(), &[2, 3], fields())).contains("key frame is 2"));
-        assert!(refusal(exact_fields(&view(), &[1, 2, 3, 4, 5], fields())).contains("reaches frame 4"));
+        assert_eq!(exact_indices(&view(), &[1, 2, 4], 3).unwrap(), [0, 2]);
+        assert!(refusal(exact_indices(&view(), &[2, 3], 3)).contains("key frame is 2"));
+        assert!(refusal(exact_indices(&view(), &[1, 2, 3, 4, 5], 3)).contains("reaches frame 4"));
     }
 
     #[test]
     fn imported_tracks_may_reach_beyond_the_job_and_must_reach_its_end() {
-        let fields = || vec![field(2.0), field(3.0), field(4.0)];
-        assert_eq!(imported_fields(&view(), 3, fields()).unwrap(), [field(2.0), field(3.0)]);
-        assert_eq!(imported_fields(&view(), 4, fields()).unwrap(), fields());
-        let message = refusal(imported_fields(&view(), 5, fields()));
+        assert_eq!(imported_indices(&view(), 3, 3).unwrap(), [0, 1]);
+        assert_eq!(imported_indices(&view(), 4, 3).unwrap(), [0, 1, 2]);
+        let message = refusal(imported_indices(&view(), 5, 3));
         assert!(message.contains("reaches 3") && message.contains("needs 4"), "{message}");
     }
 
     #[test]
     fn tracks_of_another_size_are_refused_by_both_sizes() {
-        let other = MissingView { size: (4, 2), ..view() };
-        let message = refusal(imported_fields(&other, 2, vec![field(2.0)]));
-        assert!(message.contains("2 x 1") && message.contains("4 x 2"), "{message}");
-        refusal(exact_fields(&other, &[1, 2], vec![field(2.0)]));
+        check_size(&view(), (2, 1)).unwrap();
+        let message = refusal(check_size(&view(), (4, 2)));
+        assert!(message.contains("4 x 2") && message.contains("2 x 1"), "{message}");
     }
 }

@@ -13,7 +13,7 @@
 //! `visibility` `[T, H, W]` (bool, u8 or float, visible above 0.5); optionally `sigma` `[T, H, W]`, the standard
 //! deviation per axis in pixels. Frame 0 is the key frame.
 //!
-//! [`read_tracks`] also takes what other trackers' programs give: see `conventions.rs`.
+//! [`open_tracks`] also takes what other trackers' programs give: see `conventions.rs`.
 
 use std::{
     fs::File,
@@ -29,15 +29,16 @@ use crate::tracking::TrackField;
 
 mod conventions;
 mod grid;
+mod imported;
 mod points;
 #[cfg(test)]
 mod tests;
 mod writer;
 
+pub use conventions::open_tracks;
+pub use imported::ImportedTracks;
 pub use points::PointTracks;
 pub use writer::TrackNpzWriter;
-
-pub use conventions::read_tracks;
 
 /// Smallest standard deviation of imported tracks, pixels: below it interpolation and sampling err more than tracks.
 pub const SIGMA_FLOOR: f32 = 0.05;
@@ -45,14 +46,22 @@ pub const SIGMA_FLOOR: f32 = 0.05;
 /// Standard deviation of imported tracks that state none, pixels.
 pub const DEFAULT_SIGMA: f32 = 0.5;
 
+/// Deflate, which numpy packs with, makes nothing smaller than by this.
+const DEFLATE_RATIO: u64 = 1032;
+
 /// Steps per pixel of exact flow.
 const FLOW_STEPS: f32 = 64.0;
+
+/// Reads the exact flow of one view whole: [`open_exact_flow`], every field.
+pub fn read_exact_flow(path: &Path) -> Result<Vec<TrackField>, TrackError> {
+    Ok(open_exact_flow(path)?.fields().collect())
+}
 
 /// Reads the exact flow of one view; index `i` is the field of frame `i + 2`, counting the key frame as 1.
 ///
 /// Where the flow is not valid the pixel is invisible. The standard deviation is one step of the stored flow plus
 /// [`SIGMA_FLOOR`].
-pub fn read_exact_flow(path: &Path) -> Result<Vec<TrackField>, TrackError> {
+pub fn open_exact_flow(path: &Path) -> Result<ImportedTracks, TrackError> {
     let mut archive = Archive::open(path)?;
     let flow = archive.integers(&["flow_x64"])?;
     let &[frames, height, width, 2] = &flow.shape[..] else {
@@ -74,11 +83,11 @@ pub fn read_exact_flow(path: &Path) -> Result<Vec<TrackField>, TrackError> {
         return Err(archive.shape(&valid.name, &valid.shape, expected));
     }
 
-    let first_bit = |frame: usize| frame * if by_frame { 8 * row } else { pixels };
-    let field = |(frame, flow): (usize, &[i16])| TrackField {
+    let first_bit = move |frame: usize| frame * if by_frame { 8 * row } else { pixels };
+    let field = move |frame: usize| TrackField {
         width,
         height,
-        positions: flow
+        positions: flow.values[2 * pixels * frame..2 * pixels * (frame + 1)]
             .chunks_exact(2)
             .enumerate()
             .map(|(index, flow)| {
@@ -93,7 +102,7 @@ pub fn read_exact_flow(path: &Path) -> Result<Vec<TrackField>, TrackError> {
             .collect(),
         sigma: vec![1.0 / FLOW_STEPS + SIGMA_FLOOR; pixels],
     };
-    Ok(flow.values.chunks_exact(2 * pixels).enumerate().map(field).collect())
+    Ok(ImportedTracks::new(frames as usize, (width, height), field))
 }
 
 /// Reads which pixels of a view have exact flow, of `width × height` pixels.
@@ -108,7 +117,7 @@ pub fn read_exact_validity(path: &Path, width: u32, height: u32) -> Result<Vec<b
     Ok((0..pixels).map(|index| numpy_bit(&valid.values, index)).collect())
 }
 
-/// Reads a tracker's field of one view; index `i` is the field of frame `i + 2`, counting the key frame as 1.
+/// Reads a tracker's fields of one view whole; index `i` is the field of frame `i + 2`, counting the key frame as 1.
 ///
 /// Positions that are not finite, and standard deviations that are negative or not a number, make their pixel
 /// invisible, at its place in the key frame. Standard deviations are raised to [`SIGMA_FLOOR`]; without a `sigma`
@@ -116,13 +125,13 @@ pub fn read_exact_validity(path: &Path, width: u32, height: u32) -> Result<Vec<b
 pub fn read_track_npz(path: &Path) -> Result<Vec<TrackField>, TrackError> {
     let mut archive = Archive::open(path)?;
     let tracks = archive.floats(&POSITIONS)?;
-    fields_of(&mut archive, &tracks)
+    Ok(fields_of(&mut archive, tracks)?.fields().collect())
 }
 
 /// Names of the array of positions.
 const POSITIONS: [&str; 2] = ["tracks", "positions"];
 
-fn fields_of(archive: &mut Archive<'_>, tracks: &Array<f32>) -> Result<Vec<TrackField>, TrackError> {
+fn fields_of(archive: &mut Archive<'_>, tracks: Array<f32>) -> Result<ImportedTracks, TrackError> {
     let &[frames, height, width, 2] = &tracks.shape[..] else {
         return Err(archive.shape(&tracks.name, &tracks.shape, "[T, H, W, 2]".into()));
     };
@@ -139,7 +148,8 @@ fn fields_of(archive: &mut Archive<'_>, tracks: &Array<f32>) -> Result<Vec<Track
         return Err(archive.shape(&sigma.name, &sigma.shape, expected()));
     }
 
-    let field = |frame: usize| {
+    let field = move |index: usize| {
+        let frame = index + 1;
         let mut field = TrackField {
             width: columns,
             height: rows,
@@ -158,7 +168,12 @@ fn fields_of(archive: &mut Archive<'_>, tracks: &Array<f32>) -> Result<Vec<Track
         }
         field
     };
-    Ok((1..frames as usize).map(field).collect())
+    Ok(ImportedTracks::new(later(frames), (columns, rows), field))
+}
+
+/// Frames after the key frame, of `frames` with it.
+fn later(frames: u64) -> usize {
+    frames.saturating_sub(1) as usize
 }
 
 fn pixel_centre(index: usize, width: u32) -> [f32; 2] {
@@ -181,6 +196,8 @@ struct Array<T> {
 /// An open npz file.
 struct Archive<'a> {
     path: &'a Path,
+    /// Most bytes that anything in the file can unpack to.
+    unpacked: u64,
     zip: ZipArchive<BufReader<File>>,
 }
 
@@ -188,8 +205,9 @@ impl<'a> Archive<'a> {
     fn open(path: &'a Path) -> Result<Self, TrackError> {
         let unreadable = |problem: String| TrackError::Unreadable { path: path.into(), problem };
         let file = File::open(path).map_err(|error| unreadable(error.to_string()))?;
+        let bytes = file.metadata().map_err(|error| unreadable(error.to_string()))?.len();
         let zip = ZipArchive::new(BufReader::new(file)).map_err(|error| unreadable(error.to_string()))?;
-        Ok(Self { path, zip })
+        Ok(Self { path, unpacked: bytes.saturating_mul(DEFLATE_RATIO), zip })
     }
 
     fn has(&self, name: &str) -> bool {
@@ -261,7 +279,8 @@ impl<'a> Archive<'a> {
             .zip
             .by_name(&npyz::npz::file_name_from_array_name(name))
             .map_err(|error| problem(error.to_string()))?;
-        let size = entry.size();
+        // What the entry says about its size it may say wrongly.
+        let size = entry.size().min(self.unpacked);
         let reader: &mut dyn Read = &mut entry;
         let file = NpyFile::new(reader.take(size)).map_err(|error| problem(error.to_string()))?;
         let shape = file.shape().to_vec();

@@ -12,17 +12,17 @@
 
 use std::path::Path;
 
-use super::{Archive, Array, DEFAULT_SIGMA, POSITIONS, fields_of, grid::Grid};
-use crate::{formats::TrackError, tracking::TrackField};
+use super::{Archive, Array, DEFAULT_SIGMA, ImportedTracks, POSITIONS, fields_of, grid::Grid, later};
+use crate::formats::TrackError;
 
 /// What is added to positions that count from the centre of the top-left pixel.
 const CENTRE: f32 = 0.5;
 
-/// Reads a tracker's field of one view whose images have `size` (width, height), in any of the conventions; index `i`
+/// Reads a tracker's fields of one view whose images have `size` (width, height), in any of the conventions; index `i`
 /// is the field of frame `i + 2`, counting the key frame as 1.
 ///
 /// Fields of DOT and CoTracker have the size of the images; for the project's own see [`read_track_npz`](super::read_track_npz).
-pub fn read_tracks(path: &Path, size: (u32, u32)) -> Result<Vec<TrackField>, TrackError> {
+pub fn open_tracks(path: &Path, size: (u32, u32)) -> Result<ImportedTracks, TrackError> {
     let mut archive = Archive::open(path)?;
     if archive.has("pred_tracks") {
         return cotracker(&mut archive, size);
@@ -32,12 +32,12 @@ pub fn read_tracks(path: &Path, size: (u32, u32)) -> Result<Vec<TrackField>, Tra
     }
     let tracks = archive.floats(&POSITIONS)?;
     match tracks.shape.last() {
-        Some(3) => dot(&archive, &tracks, size),
-        _ => fields_of(&mut archive, &tracks),
+        Some(3) => dot(&archive, tracks, size),
+        _ => fields_of(&mut archive, tracks),
     }
 }
 
-fn dot(archive: &Archive<'_>, tracks: &Array<f32>, size: (u32, u32)) -> Result<Vec<TrackField>, TrackError> {
+fn dot(archive: &Archive<'_>, tracks: Array<f32>, size: (u32, u32)) -> Result<ImportedTracks, TrackError> {
     let (frames, height, width) = match tracks.shape[..] {
         [frames, height, width, 3] | [1, frames, height, width, 3] => (frames, height, width),
         _ => {
@@ -49,17 +49,18 @@ fn dot(archive: &Archive<'_>, tracks: &Array<f32>, size: (u32, u32)) -> Result<V
     let scale = [size.0 as f32 / width as f32, size.1 as f32 / height as f32];
     let grid = Grid::of_pixels((width, height), size);
     let sigma = DEFAULT_SIGMA * scale[0].max(scale[1]).max(1.0);
-    let field = |frame: usize| {
+    let field = move |index: usize| {
+        let frame = index + 1;
         let entries = &tracks.values[3 * pixels * frame..3 * pixels * (frame + 1)];
         let positions = entries.chunks_exact(3);
         let position = |entry: &[f32]| [(entry[0] + CENTRE) * scale[0], (entry[1] + CENTRE) * scale[1]];
         let points: Vec<_> = positions.map(|entry| (position(entry), entry[2] > 0.5)).collect();
         grid.field(&points, sigma, size)
     };
-    Ok((1..frames as usize).map(field).collect())
+    Ok(ImportedTracks::new(later(frames), size, field))
 }
 
-fn cotracker(archive: &mut Archive<'_>, size: (u32, u32)) -> Result<Vec<TrackField>, TrackError> {
+fn cotracker(archive: &mut Archive<'_>, size: (u32, u32)) -> Result<ImportedTracks, TrackError> {
     let tracks = archive.floats(&["pred_tracks"])?;
     let (frames, points) = match tracks.shape[..] {
         [frames, points, 2] | [1, frames, points, 2] if frames > 0 && points > 0 => (frames, points),
@@ -84,7 +85,8 @@ fn cotracker(archive: &mut Archive<'_>, size: (u32, u32)) -> Result<Vec<TrackFie
              without queries, or with grid_size), or give every pixel as `tracks` [T, H, W, 2]"
         ),
     })?;
-    let field = |frame: usize| {
+    let field = move |index: usize| {
+        let frame = index + 1;
         let entries = frame * points..(frame + 1) * points;
         let positions = tracks.values[2 * entries.start..2 * entries.end].chunks_exact(2);
         let points: Vec<_> = positions
@@ -93,7 +95,7 @@ fn cotracker(archive: &mut Archive<'_>, size: (u32, u32)) -> Result<Vec<TrackFie
             .collect();
         grid.field(&points, DEFAULT_SIGMA, size)
     };
-    Ok((1..frames as usize).map(field).collect())
+    Ok(ImportedTracks::new(later(frames), size, field))
 }
 
 /// Where the points are in the key frame, and the array that says so: the queries, or the first frame's positions.

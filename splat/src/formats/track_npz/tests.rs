@@ -306,3 +306,25 @@ fn points_of_another_shape_are_refused() {
     let error = PointTracks::read(&path).unwrap_err().to_string();
     assert!(error.contains("`visible`") && error.contains("[2, 2, 1]"), "{error}");
 }
+
+#[test]
+fn what_an_entry_says_about_its_size_reserves_nothing() {
+    // Both the directory and the array claim 4 GB; the file has not 200 bytes.
+    let mut bytes = Vec::new();
+    let options = npyz::WriteOptions::<f32>::new().default_dtype().shape(&[1 << 30]);
+    drop(options.writer(&mut bytes).begin_nd().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tracks.npz");
+    let mut zip = ZipWriter::new(File::create(&path).unwrap());
+    let stored = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    zip.start_file("tracks.npy", stored).unwrap();
+    zip.write_all(&bytes).unwrap();
+    zip.finish().unwrap();
+    let mut file = std::fs::read(&path).unwrap();
+    // Uncompressed size in the central directory, whose header begins with this signature.
+    let header = file.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
+    file[header + 24..header + 28].copy_from_slice(&0xffff_fff0_u32.to_le_bytes());
+    std::fs::write(&path, file).unwrap();
+    let message = read_track_npz(&path).unwrap_err().to_string();
+    assert!(message.contains("tracks.npz") && message.contains("needs more than"), "{message}");
+}

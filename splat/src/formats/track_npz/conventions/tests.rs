@@ -4,10 +4,13 @@ use super::{
     super::{SIGMA_FLOOR, tests::Npz},
     *,
 };
+use crate::tracking::TrackField;
 
 fn read(npz: Npz, size: (u32, u32)) -> Result<Vec<TrackField>, String> {
     let (_folder, path) = npz.finish();
-    read_tracks(&path, size).map_err(|error| error.to_string())
+    let tracks = open_tracks(&path, size).map_err(|error| error.to_string())?;
+    assert!(tracks.field(tracks.count()).is_none());
+    Ok(tracks.fields().collect())
 }
 
 /// Whether fields agree but for rounding.
@@ -197,5 +200,31 @@ fn refusals_name_file_array_and_remedy() {
         let message = read(npz, (9, 9)).unwrap_err();
         assert!(message.contains("tracks.npz"), "{message}");
         assert!(expected.iter().all(|part| message.contains(part)), "{message}");
+    }
+}
+
+#[test]
+fn a_small_file_of_many_frames_is_not_expanded() {
+    // One point per frame, of images of 2 million pixels: as fields, 3.6 TB.
+    const FRAMES: usize = 100_000;
+    let size = (1920, 1080);
+    let point = |frame: usize| [960.0 + frame as f32, 540.0];
+    let positions: Vec<f32> = (0..FRAMES).flat_map(point).collect();
+    let cotracker = Npz::new().array("pred_tracks", &[FRAMES as u64, 1, 2], &positions).array(
+        "pred_visibility",
+        &[FRAMES as u64, 1],
+        &[true; FRAMES],
+    );
+    let entries: Vec<f32> = (0..FRAMES).flat_map(|frame| [frame as f32 / size.0 as f32, 0.0, 1.0]).collect();
+    let dot = Npz::new().array("tracks", &[FRAMES as u64, 1, 1, 3], &entries);
+    for npz in [cotracker, dot] {
+        let (_folder, path) = npz.finish();
+        let tracks = open_tracks(&path, size).unwrap();
+        assert_eq!((tracks.count(), tracks.size()), (FRAMES - 1, size));
+        let field = tracks.field(6).unwrap();
+        assert_eq!((field.width, field.height), size);
+        // A grid of one point moves every pixel alike: by 7 pixels in the eighth frame.
+        assert_close(&field, |x, y| [x + 7.0, y]);
+        assert!(tracks.field(FRAMES - 1).is_none());
     }
 }
