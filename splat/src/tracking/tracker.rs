@@ -38,4 +38,22 @@ impl Tracker {
             Self::Learned(tracker) => tracker.track_view(frame_count, load, settings, emit),
         }
     }
+    /// [`Self::track_view`] where the fields of some frames are there already.
+    ///
+    /// Frames that are not wanted and on which no wanted one depends are neither loaded nor tracked. Fields that have to
+    /// be made for the sake of later ones are emitted, wanted or not.
+    pub fn track_missing<E: From<LearnedError>>(
+        &self,
+        frame_count: usize,
+        is_wanted: &dyn Fn(usize) -> bool,
+        load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+        settings: &TrackingSettings,
+        emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let needed = (1..frame_count).rev().find(|&index| is_wanted(index)).map_or(0, |last| last + 1);
+        match self {
+            Self::BuiltIn => track_view(needed, load, settings, emit),
+            Self::Learned(tracker) => tracker.track_missing(needed, is_wanted, load, settings, emit),
+        }
+    }
 }

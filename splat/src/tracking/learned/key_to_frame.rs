@@ -18,18 +18,20 @@ const VISIBLE: f32 = 0.5;
 pub(super) fn track_view<E: From<LearnedError>>(
     tracker: &LearnedTracker,
     frame_count: usize,
+    is_wanted: &dyn Fn(usize) -> bool,
     load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
     settings: &TrackingSettings,
     emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
 ) -> Result<(), E> {
-    if frame_count < 2 {
+    let mut wanted = (1..frame_count).filter(|&index| is_wanted(index)).peekable();
+    if wanted.peek().is_none() {
         return Ok(());
     }
     let key_image = load(0)?;
     let size = (key_image.width, key_image.height);
     let key = if key_image.pixel_count() == 0 { None } else { Some(tracker.input(&key_image)?) };
     drop(key_image);
-    for index in 1..frame_count {
+    for index in wanted {
         let image = load(index)?;
         let field = match &key {
             Some(key) if (image.width, image.height) == size => {

@@ -72,9 +72,26 @@ impl LearnedTracker {
         settings: &TrackingSettings,
         emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
     ) -> Result<(), E> {
+        self.track_missing(frame_count, &|_| true, load, settings, emit)
+    }
+
+    /// [`Self::track_view`] where fields may be there already: see [`Tracker::track_missing`](super::Tracker::track_missing).
+    pub(super) fn track_missing<E: From<LearnedError>>(
+        &self,
+        frame_count: usize,
+        is_wanted: &dyn Fn(usize) -> bool,
+        load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+        settings: &TrackingSettings,
+        emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+    ) -> Result<(), E> {
         match self.signature() {
-            Signature::PairFlow => view::track_frames(frame_count, load, settings, self, emit),
-            Signature::KeyToFrame => key_to_frame::track_view(self, frame_count, load, settings, emit),
+            Signature::PairFlow => {
+                let settings = self.chained(settings);
+                view::track_frames(frame_count, load, &settings, self, emit)
+            }
+            Signature::KeyToFrame => {
+                key_to_frame::track_view(self, frame_count, is_wanted, load, settings, emit)
+            }
         }
     }
 }

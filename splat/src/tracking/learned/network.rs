@@ -101,6 +101,11 @@ impl Network {
         }
     }
 
+    /// Longer side of the largest images that the network sees; at least 1.
+    pub(super) fn longest_side(&self) -> usize {
+        self.ports.size.map_or(self.max_side, |(width, height)| width.max(height))
+    }
+
     /// An image, three channels of `height * width` values from 0 to 255, as the network takes it; sides of at least 1.
     pub(super) fn input(
         &self,

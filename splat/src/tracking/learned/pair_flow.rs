@@ -39,6 +39,14 @@ impl PairMatcher for LearnedTracker {
 }
 
 impl LearnedTracker {
+    /// The settings of the chains around the network: images are halved only as far as leaves it the resolution that it
+    /// takes.
+    pub(super) fn chained(&self, settings: &TrackingSettings) -> TrackingSettings {
+        // Halving an image of twice the side or more leaves the side; `max_side` is the largest that is not halved.
+        let seen = 2 * self.network.longest_side() as u32 - 1;
+        TrackingSettings { max_side: settings.max_side.max(seen), ..settings.clone() }
+    }
+
     fn flow(&self, first: &Input, second: &Input) -> Result<Flow, LearnedError> {
         let maps = self.network.run(first, second)?;
         Ok(flow_of(first, &maps))

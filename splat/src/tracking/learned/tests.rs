@@ -7,6 +7,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::{test_model::Net, *};
+use crate::tracking::Tracker;
 
 /// Change of red per pixel along x, and of green per pixel along y.
 const SLOPE: f32 = 0.01;
@@ -118,6 +119,75 @@ fn pair_flow_is_chained_and_judged() {
         // The last column moves out of the image.
         assert!(!field.visible[63]);
     }
+}
+
+#[test]
+fn a_pair_network_sees_what_its_own_settings_say() {
+    // Frames of 200 pixels; the built-in tracker would see 25. A network that sees fewer pixels than the slope is for
+    // measures a motion that is wrong by their ratio.
+    let chains = TrackingSettings { max_side: 32, ..TrackingSettings::default() };
+    let motion = [3.0, -1.0];
+    let seen_whole = (pair_net(255.0 * SLOPE), OnnxSettings::default());
+    let seen_halved =
+        (pair_net(2.0 * 255.0 * SLOPE), OnnxSettings { max_side: 100, ..OnnxSettings::default() });
+    let for_one_size = coordinates(Net::of_images(Some([48, 100])), 2.0 * 255.0 * SLOPE).output("flow");
+    for (net, onnx) in [seen_whole, seen_halved, (for_one_size, OnnxSettings::default())] {
+        let tracker = LearnedTracker::from_onnx(net.bytes(), "net.onnx", &onnx).unwrap();
+        let mut fields = Vec::new();
+        let mut emit = |_, field| {
+            fields.push(field);
+            Ok(())
+        };
+        let mut load = |t| Ok(frame((200, 96), motion, 60.0, t));
+        tracker.track_view::<LearnedError>(2, &mut load, &chains, &mut emit).unwrap();
+        let (error, visible) = error_and_visible(&fields[0], motion);
+        // A tenth of what a halving too many would cost: half of 3 pixels.
+        assert!(error < 0.15, "{onnx:?}: {error}");
+        assert!(visible > 0.8, "{onnx:?}: {visible}");
+    }
+}
+
+#[test]
+fn fields_that_exist_cost_a_key_to_frame_network_nothing() {
+    let net = key_net(255.0 * SLOPE).bytes();
+    let tracker = Tracker::new(Some((net, "net.onnx")), &TrackingSettings::default()).unwrap();
+    let image = |t: usize| frame((32, 24), [1.0, 0.5], 0.0, t);
+    let missing = |wanted: &[usize]| {
+        let (mut loaded, mut made) = (Vec::new(), Vec::new());
+        let mut load = |index| {
+            loaded.push(index);
+            Ok::<_, LearnedError>(image(index))
+        };
+        let mut emit = |index, field| {
+            made.push((index, field));
+            Ok(())
+        };
+        let settings = TrackingSettings::default();
+        tracker.track_missing(6, &|index| wanted.contains(&index), &mut load, &settings, &mut emit).unwrap();
+        (loaded, made)
+    };
+    let (loaded, all) = missing(&[1, 2, 3, 4, 5]);
+    assert_eq!(loaded, [0, 1, 2, 3, 4, 5]);
+    let (loaded, some) = missing(&[2, 4]);
+    assert_eq!(loaded, [0, 2, 4]);
+    assert_eq!(some, [all[1].clone(), all[3].clone()]);
+    let (loaded, none) = missing(&[]);
+    assert!(loaded.is_empty() && none.is_empty());
+}
+
+#[test]
+fn a_pair_network_tracks_up_to_the_last_missing_field() {
+    let net = pair_net(255.0 * SLOPE).bytes();
+    let tracker = Tracker::new(Some((net, "net.onnx")), &TrackingSettings::default()).unwrap();
+    let mut made = Vec::new();
+    let mut load = |t| Ok::<_, LearnedError>(frame((32, 24), [1.0, 0.5], 0.0, t));
+    let mut emit = |index, _| {
+        made.push(index);
+        Ok(())
+    };
+    let settings = TrackingSettings::default();
+    tracker.track_missing(6, &|index| index == 3, &mut load, &settings, &mut emit).unwrap();
+    assert_eq!(made, [1, 2, 3]);
 }
 
 #[test]
