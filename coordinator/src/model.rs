@@ -3,8 +3,23 @@
 use std::{fs::File, io::Read, path::Path};
 
 use splat::tracking::learned::MAX_MODEL_BYTES;
+use trackersplat_proto::v1::Blob;
 
-use crate::request::InputFile;
+use crate::{failure::StageError, hub::Hub, keys::digest_of, request::InputFile, store::Artifact};
+
+/// Key of a network among the artifacts.
+pub(crate) fn key(file: &InputFile) -> String {
+    digest_of(&("tracker model", &file.digest))
+}
+
+/// Puts a network into the store, where workers find it.
+pub(crate) async fn keep(hub: &Hub, file: &InputFile, bytes: Vec<u8>) -> Result<Blob, StageError> {
+    let artifact = Artifact { blob: hub.blobs.put(bytes.into()).await?, note: String::new() };
+    let mut change = hub.store.change().await?;
+    change.put_artifact(&key(file), "tracker model", &artifact).await?;
+    change.commit().await?;
+    Ok(artifact.blob)
+}
 
 /// A model file whole, and its digest; the reason, with the file's name, if it cannot be.
 pub(crate) fn read(path: &Path) -> Result<(InputFile, Vec<u8>), String> {

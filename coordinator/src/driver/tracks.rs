@@ -16,7 +16,7 @@ use crate::{
     ledger::{Field, TrackLedger, TrackedView},
     model,
     request::{InputFile, TrackSource},
-    store::{Artifact, ViewRecord},
+    store::ViewRecord,
 };
 
 impl Job {
@@ -85,18 +85,14 @@ impl Job {
 
     /// The network in the store, where workers find it.
     async fn model_blob(&self, file: &InputFile) -> Result<Blob, StageError> {
-        let key = digest_of(&("tracker model", &file.digest));
-        if let Some(held) = self.held_artifact(&key).await? {
+        if let Some(held) = self.held_artifact(&model::key(file)).await? {
             return Ok(held.blob);
         }
+        // It was put there at submission: somebody has removed it.
         let submitted = file.clone();
         let read = move || model::read_again(&submitted).map_err(StageError::bad_input);
         let bytes = self.hub.compute.run(read).await?;
-        let artifact = Artifact { blob: self.hub.blobs.put(bytes.into()).await?, note: String::new() };
-        let mut change = self.hub.store.change().await?;
-        change.put_artifact(&key, "tracker model", &artifact).await?;
-        change.commit().await?;
-        Ok(artifact.blob)
+        model::keep(&self.hub, file, bytes).await
     }
 
     async fn tracked_view(

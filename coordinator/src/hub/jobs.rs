@@ -58,10 +58,18 @@ impl Hub {
         Ok(())
     }
 
-    /// An ended job begins again with what it has; failed and cancelled tasks get all their attempts again.
-    pub(crate) async fn resubmit_job(self: &Arc<Self>, job: &str, clip: Arc<Clip>) -> Result<(), StoreError> {
+    /// An ended job begins again with what it has; failed and cancelled tasks get all their attempts again. Its files may
+    /// have moved: they are where `clip_path` and `request` say now.
+    pub(crate) async fn resubmit_job(
+        self: &Arc<Self>,
+        job: &str,
+        clip_path: &str,
+        request: &str,
+        clip: Arc<Clip>,
+    ) -> Result<(), StoreError> {
         let mut change = self.store.change().await?;
         let Ok(next) = change.job_state(job).await?.after(JobTrigger::Resubmit) else { return Ok(()) };
+        change.set_job_inputs(job, clip_path, request).await?;
         change.set_job_state(job, next, None).await?;
         change.append_job_event(job, next, None).await?;
         change.reopen_tasks(job).await?;

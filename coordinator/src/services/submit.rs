@@ -19,6 +19,7 @@ use super::{
 };
 use crate::{
     assembly::{SEQUENCE, holds_results},
+    failure::StageError,
     hub::{Hub, SharedHub},
     keys::VERSION,
     model,
@@ -36,6 +37,8 @@ struct Submission {
     settings: Settings,
     settings_digest: String,
     request: JobRequest,
+    /// The network of a learned tracker, whole.
+    model: Option<Vec<u8>>,
     /// Empty: the coordinator chooses.
     output_request: String,
 }
@@ -82,10 +85,11 @@ pub(super) async fn submit(
     let (clip_path, url) = (clip.path.clone(), clip.url.clone());
     let reading = tokio::task::spawn_blocking(move || read(request, clip_path, url, scratch)).await;
     let submission = reading.map_err(|error| Status::internal(format!("reading the submission: {error}")))?;
-    let submission = submission.map_err(|status| {
+    let mut submission = submission.map_err(|status| {
         let path = clip.path.display().to_string();
         Status::new(status.code(), by_url(status.message(), &path, clip.url.as_deref()))
     })?;
+    keep_model(hub, &mut submission).await?;
     let known = hub
         .store
         .same_job(&submission.clip_digest, &submission.settings_digest, &submission.output_request)
@@ -94,6 +98,23 @@ pub(super) async fn submit(
     match known {
         Some(job) => resume(hub, job, submission).await,
         None => begin(hub, submission).await,
+    }
+}
+
+/// Puts the network into the store: from here on the job does not need its file.
+async fn keep_model(hub: &Hub, submission: &mut Submission) -> Result<(), Status> {
+    let (TrackSource::Learned(file), Some(bytes)) = (&submission.request.tracks, submission.model.take())
+    else {
+        return Ok(());
+    };
+    match model::keep(hub, file, bytes).await {
+        Ok(_) => Ok(()),
+        Err(StageError::State(error)) => Err(state_failed(hub, error)),
+        Err(StageError::Failed(failure)) => Err(Status::unavailable(format!(
+            "storing the tracker {}: {}; submit again",
+            file.path, failure.message
+        ))),
+        Err(StageError::Stopped) => Err(Status::unavailable("the coordinator shuts down; submit again")),
     }
 }
 
@@ -109,7 +130,9 @@ async fn resume(hub: &SharedHub, job: JobRecord, submission: Submission) -> Resu
         return Ok(response);
     }
     claim(hub, &output, &submission, &job.id).await?;
-    let resumed = hub.resubmit_job(&job.id, submission.clip).await;
+    let clip_path = submission.clip_path.display().to_string();
+    let request = json("the request", serde_json::to_string(&submission.request))?;
+    let resumed = hub.resubmit_job(&job.id, &clip_path, &request, submission.clip).await;
     resumed.map_err(|error| state_failed(hub, error))?;
     Ok(response)
 }
@@ -121,9 +144,6 @@ async fn begin(hub: &SharedHub, submission: Submission) -> Result<SubmitResponse
         chosen => PathBuf::from(chosen),
     };
     claim(hub, &output, &submission, &id).await?;
-    let json = |what: &str, value: serde_json::Result<String>| {
-        value.map_err(|error| Status::internal(format!("{what} as JSON: {error}")))
-    };
     let job = NewJob {
         id: id.clone(),
         clip: submission.clip_path.display().to_string(),
@@ -137,6 +157,10 @@ async fn begin(hub: &SharedHub, submission: Submission) -> Result<SubmitResponse
     };
     hub.create_job(&job, submission.clip).await.map_err(|error| state_failed(hub, error))?;
     Ok(SubmitResponse { job_id: id, resumed: false })
+}
+
+fn json(what: &str, value: serde_json::Result<String>) -> Result<String, Status> {
+    value.map_err(|error| Status::internal(format!("{what} as JSON: {error}")))
 }
 
 /// Makes sure that the output folder is this job's, or nobody's who has results in it, and marks it.
@@ -184,6 +208,7 @@ fn read(
     scratch: PathBuf,
 ) -> Result<Submission, Status> {
     let settings = read_settings(&request.settings_json)?;
+    let (tracks, model) = read_tracks(request.tracks, &settings)?;
     let mut job_request = JobRequest {
         frames: read_frames(request.first_frame, request.last_frame)?,
         test_views: request.test_views,
@@ -191,7 +216,7 @@ fn read(
             "" => None,
             path => Some(input_file("static model", path)?),
         },
-        tracks: read_tracks(request.tracks, &settings)?,
+        tracks,
         clip_url,
         ..JobRequest::default()
     };
@@ -229,6 +254,7 @@ fn read(
         settings,
         settings_digest,
         request: job_request,
+        model,
         output_request,
     })
 }
@@ -251,24 +277,28 @@ fn read_frames(first: u32, last: u32) -> Result<Option<(u32, u32)>, Status> {
     }
 }
 
-fn read_tracks(tracks: Option<Tracks>, settings: &Settings) -> Result<TrackSource, Status> {
+/// Where the tracks come from, and the network where they come from one.
+fn read_tracks(
+    tracks: Option<Tracks>,
+    settings: &Settings,
+) -> Result<(TrackSource, Option<Vec<u8>>), Status> {
     match tracks {
-        None => Ok(TrackSource::Own),
-        Some(Tracks::ExactTracks(_)) => Ok(TrackSource::Exact(Vec::new())),
+        None => Ok((TrackSource::Own, None)),
+        Some(Tracks::ExactTracks(_)) => Ok((TrackSource::Exact(Vec::new()), None)),
         Some(Tracks::TrackFiles(files)) if files.paths.is_empty() => {
             Err(Status::invalid_argument("track_files names no file; give one npz per training view"))
         }
         Some(Tracks::TrackFiles(files)) => {
             let files: Result<_, _> = files.paths.iter().map(|path| input_file("tracks", path)).collect();
-            files.map(TrackSource::Files)
+            Ok((TrackSource::Files(files?), None))
         }
         Some(Tracks::TrackerModel(path)) => {
             let (file, bytes) =
                 model::read(&local_path("tracker", &path)?).map_err(Status::invalid_argument)?;
             // What no worker could use is refused before anything is computed for it.
-            LearnedTracker::from_onnx(bytes, &file.path, &settings.tracking.onnx)
+            LearnedTracker::from_onnx(bytes.clone(), &file.path, &settings.tracking.onnx)
                 .map_err(|error| Status::invalid_argument(error.to_string()))?;
-            Ok(TrackSource::Learned(file))
+            Ok((TrackSource::Learned(file), Some(bytes)))
         }
     }
 }

@@ -184,6 +184,13 @@ impl Change {
         Ok(())
     }
 
+    /// Where the job's files are: the clip's path, and the request with the others'.
+    pub async fn set_job_inputs(&mut self, job: &str, clip: &str, request: &str) -> Result<(), StoreError> {
+        let sql = "UPDATE jobs SET clip = ?, request = ? WHERE id = ?";
+        sqlx::query(sql).bind(clip).bind(request).bind(job).execute(&mut *self.transaction).await?;
+        Ok(())
+    }
+
     /// The job's static model and how it came about.
     pub async fn set_static_model(
         &mut self,

@@ -4,7 +4,9 @@
 use prost::Message;
 use splat::{formats::track_blob, tracking::TrackField};
 use tonic::Code;
-use trackersplat_proto::v1::{JobState, SubmitRequest, job_event::Event, submit_request::Tracks};
+use trackersplat_proto::v1::{
+    CancelRequest, JobState, SubmitRequest, job_event::Event, submit_request::Tracks,
+};
 
 use super::harness::{Bench, frame_job, track_job};
 
@@ -161,4 +163,25 @@ async fn a_file_that_is_no_tracker_is_refused_before_anything_is_computed() {
     other.graph.outputs[0].name = "visibility".into();
     std::fs::write(bench.path("other.onnx"), other.encode_to_vec()).unwrap();
     assert!(refusal("other.onnx").await.contains("no output flow"));
+}
+
+#[tokio::test]
+async fn a_job_needs_its_network_no_more_once_it_is_submitted() {
+    let bench = Bench::start().await;
+    let bytes = network([1.0, 0.0]);
+    let digest = blake3::hash(&bytes).to_hex();
+    std::fs::write(bench.path("net.onnx"), &bytes).unwrap();
+    let mut worker = bench.worker("w").await;
+    let job = bench.submit(submission(&bench, "net.onnx")).await.unwrap().job_id;
+    std::fs::rename(bench.path("net.onnx"), bench.path("moved.onnx")).unwrap();
+    assert_eq!(bench.get(&digest).await.unwrap(), bytes);
+    assert_eq!(track_job(&worker.lease().await).tracker.unwrap().model.unwrap().digest, digest.as_str());
+
+    // Submitted again from its new place it is the same job, which knows the file by that place.
+    let request = CancelRequest { job_id: job.clone() };
+    bench.jobs().cancel(request).await.unwrap();
+    let again = bench.submit(submission(&bench, "moved.onnx")).await.unwrap();
+    assert_eq!((again.job_id.as_str(), again.resumed), (job.as_str(), true));
+    let stored = bench.hub().store.job(&job).await.unwrap().unwrap().request;
+    assert!(stored.contains("moved.onnx") && !stored.contains("net.onnx"), "{stored}");
 }
