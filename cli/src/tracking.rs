@@ -1,15 +1,22 @@
 //! What `track` and `eval-tracks` share: which views and frames of a clip, and how they are tracked.
 
-use std::path::{Path, PathBuf};
+use std::{
+    fs::File,
+    io::Read,
+    path::{Path, PathBuf},
+};
 
 use clap::Args;
 use splat::{
     clip::{Clip, ClipOptions, Split},
-    tracking::{TrackField, TrackingSettings, track_view},
+    tracking::{
+        TrackField, Tracker, TrackingSettings,
+        learned::{LearnedError, MAX_MODEL_BYTES},
+    },
 };
 
 use crate::{
-    args::QualityArg,
+    args::{QualityArg, TrackerArg},
     error::CliError,
     frame_range::FrameRange,
     layers::SettingsLayers,
@@ -31,9 +38,13 @@ pub(crate) struct ViewsArgs {
     pub(crate) views: Vec<String>,
 }
 
-/// How the built-in tracker is set.
+/// What tracks, and how it is set.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrackerArgs {
+    /// A neural network in place of the built-in tracker: an ONNX file, as docs/trackers.md describes it.
+    #[arg(long, value_name = "onnx:FILE", help_heading = "Tracking")]
+    pub(crate) tracker: Option<TrackerArg>,
+
     /// How much time to trade for accuracy.
     #[arg(long, value_enum, default_value_t, help_heading = "Tracking")]
     pub(crate) quality: QualityArg,
@@ -61,6 +72,40 @@ impl TrackerArgs {
             ..SettingsLayers::default()
         };
         Ok(layers.resolve()?.tracking)
+    }
+
+    /// The tracker that was asked for.
+    pub(crate) fn load(&self, settings: &TrackingSettings) -> Result<Tracker, CliError> {
+        let model = match &self.tracker {
+            Some(TrackerArg { file }) => Some((read_model(file)?, file.as_str())),
+            None => None,
+        };
+        Tracker::new(model, settings).map_err(|error| CliError::BadInput(error.to_string()))
+    }
+}
+
+fn read_model(file: &str) -> Result<Vec<u8>, CliError> {
+    let bad = |why: String| CliError::bad_input(format!("--tracker onnx:{file}"), why);
+    let mut bytes = Vec::new();
+    // One byte more than may be: the tracker refuses it by its own words.
+    let opened =
+        File::open(file).and_then(|file| file.take(MAX_MODEL_BYTES as u64 + 1).read_to_end(&mut bytes));
+    opened.map_err(|error| bad(format!("{error}; check that the file is there and may be read")))?;
+    Ok(bytes)
+}
+
+/// What ends the tracking of a view early.
+struct Stop(CliError);
+
+impl From<CliError> for Stop {
+    fn from(error: CliError) -> Self {
+        Self(error)
+    }
+}
+
+impl From<LearnedError> for Stop {
+    fn from(error: LearnedError) -> Self {
+        Self(CliError::BadInput(error.to_string()))
     }
 }
 
@@ -98,17 +143,21 @@ impl ChosenViews {
         &self.clip().views()[position].name
     }
 
-    /// Tracks of one view by the built-in tracker, given frame by frame: `take(i, field)`, from index 1.
+    /// Tracks of one view, given frame by frame: `take(i, field)`, from index 1.
     pub(crate) fn track(
         &self,
         position: usize,
+        tracker: &Tracker,
         settings: &TrackingSettings,
         take: &mut dyn FnMut(usize, TrackField) -> Result<(), CliError>,
     ) -> Result<(), CliError> {
         let clip = self.clip();
-        let mut load =
-            |index: usize| clip.image(position, index).map_err(|error| CliError::BadInput(error.to_string()));
-        track_view(clip.frames().len(), &mut load, settings, take)
+        let mut load = |index: usize| {
+            Ok::<_, Stop>(clip.image(position, index).map_err(|error| CliError::BadInput(error.to_string()))?)
+        };
+        let mut emit = |index: usize, field: TrackField| Ok(take(index, field)?);
+        let ended = tracker.track_view(clip.frames().len(), &mut load, settings, &mut emit);
+        ended.map_err(|Stop(error)| error)
     }
 
     /// The file of each chosen view: by name where every file is named after a chosen view, else by order.
@@ -158,8 +207,12 @@ mod tests {
 
     #[test]
     fn only_settings_of_the_tracker_are_taken() {
-        let args =
-            |set: &str| TrackerArgs { quality: QualityArg::Draft, settings: None, set: vec![set.to_owned()] };
+        let args = |set: &str| TrackerArgs {
+            tracker: None,
+            quality: QualityArg::Draft,
+            settings: None,
+            set: vec![set.to_owned()],
+        };
         let settings = args("tracking.gaps=[1, 4]").settings();
         assert!(settings.is_ok_and(|settings| settings.gaps == [1, 4]));
         for wrong in ["refine.iterations=3", "tracking.no_such=3", "seed=1"] {
@@ -167,5 +220,24 @@ mod tests {
             assert_eq!(error.exit_code(), 3);
             assert!(error.to_string().contains(wrong), "{error}");
         }
+    }
+
+    #[test]
+    fn a_file_that_is_no_network_is_refused_by_its_name() {
+        let folder = tempfile::tempdir().expect("a folder for tests");
+        let path = folder.path().join("net.onnx");
+        let file = path.display().to_string();
+        let args = TrackerArgs {
+            tracker: Some(TrackerArg { file: file.clone() }),
+            quality: QualityArg::Draft,
+            settings: None,
+            set: Vec::new(),
+        };
+        let refusal = || args.load(&TrackingSettings::default()).expect_err("no network").to_string();
+        assert!(refusal().contains(&file) && refusal().contains("may be read"), "{}", refusal());
+        std::fs::write(&path, b"no network").expect("a file for tests");
+        assert!(refusal().contains(&file) && refusal().contains("docs/trackers.md"), "{}", refusal());
+        let built_in = TrackerArgs { tracker: None, ..args.clone() };
+        assert!(matches!(built_in.load(&TrackingSettings::default()), Ok(Tracker::BuiltIn)));
     }
 }

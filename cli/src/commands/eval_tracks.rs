@@ -7,9 +7,9 @@ use indicatif::ProgressBar;
 use rayon::prelude::*;
 use serde::Serialize;
 use splat::{
-    formats::track_npz::{self, PointTracks},
+    formats::track_npz::{self, ImportedTracks, PointTracks},
     metrics::tracks::{FieldReport, FieldScores, GroupReport, PointReport, PointScores},
-    tracking::{TrackField, TrackingSettings},
+    tracking::{TrackField, Tracker, TrackingSettings},
 };
 
 use super::{print_json, track::progress};
@@ -30,9 +30,10 @@ pub(crate) struct EvalTracksArgs {
     #[command(flatten)]
     views: ViewsArgs,
 
-    /// Tracks to measure, an npz per view, in view order or named after the views [default: the built-in tracker's].
+    /// Tracks to measure, an npz per view, in view order or named after the views, in any convention of
+    /// docs/trackers.md [default: the tracker's].
     #[arg(long, value_name = "FILE", num_args = 1.., help_heading = "Input",
-          conflicts_with_all = ["quality", "settings", "set"])]
+          conflicts_with_all = ["tracker", "quality", "settings", "set"])]
     tracks: Vec<PathBuf>,
 
     #[command(flatten)]
@@ -83,6 +84,7 @@ struct Mean {
 
 pub(super) fn run(args: EvalTracksArgs, logs: &LogArgs) -> Result<(), CliError> {
     let settings = args.tracker.settings()?;
+    let tracker = args.tracker.load(&settings)?;
     let views = ChosenViews::open(&args.views)?;
     if views.clip().frames()[0] != 1 {
         let why = format!("exact flow starts at frame 1, not at {}", views.clip().frames()[0]);
@@ -99,7 +101,7 @@ pub(super) fn run(args: EvalTracksArgs, logs: &LogArgs) -> Result<(), CliError> 
     let measure = |rank: usize| {
         let source = match &files {
             Some(files) => TrackSource::File(files[rank]),
-            None => TrackSource::Own(&settings),
+            None => TrackSource::Tracker(&tracker, &settings),
         };
         let position = views.positions[rank];
         ViewScores::measure(&views, position, source, points.as_ref(), args.pictures.as_deref(), &bar)
@@ -118,7 +120,7 @@ pub(super) fn run(args: EvalTracksArgs, logs: &LogArgs) -> Result<(), CliError> 
 /// Where the tracks of a view come from.
 #[derive(Clone, Copy)]
 enum TrackSource<'a> {
-    Own(&'a TrackingSettings),
+    Tracker(&'a Tracker, &'a TrackingSettings),
     File(&'a Path),
 }
 
@@ -198,9 +200,9 @@ impl ViewScores {
             Ok(())
         };
         match source {
-            TrackSource::Own(settings) => views.track(position, settings, &mut take)?,
+            TrackSource::Tracker(tracker, settings) => views.track(position, tracker, settings, &mut take)?,
             TrackSource::File(file) => {
-                for (index, field) in (1..).zip(read_tracks(views, position, file)?) {
+                for (index, field) in (1..).zip(open_tracks(views, position, file)?.fields()) {
                     take(index, field)?;
                 }
             }
@@ -222,26 +224,22 @@ impl ViewScores {
     }
 }
 
-fn read_tracks(views: &ChosenViews, position: usize, file: &Path) -> Result<Vec<TrackField>, CliError> {
-    let fields = track_npz::read_track_npz(file).map_err(|error| CliError::BadInput(error.to_string()))?;
+fn open_tracks(views: &ChosenViews, position: usize, file: &Path) -> Result<ImportedTracks, CliError> {
     let clip = views.clip();
-    let frames = clip.frames().len();
-    if fields.len() + 1 != frames {
-        let why = format!(
-            "it has {} frames, {frames} are to be measured; choose them with --frames",
-            fields.len() + 1
-        );
+    let camera = &clip.views()[position].camera;
+    let size = (camera.width, camera.height);
+    let tracks = track_npz::open_tracks(file, size).map_err(|error| CliError::BadInput(error.to_string()))?;
+    let (held, frames) = (tracks.count() + 1, clip.frames().len());
+    if held != frames {
+        let why = format!("it has {held} frames, {frames} are to be measured; choose them with --frames");
         return Err(CliError::bad_input(file.display(), why));
     }
-    let camera = &clip.views()[position].camera;
-    if let Some(field) = fields.first()
-        && (field.width, field.height) != (camera.width, camera.height)
-    {
-        let found = format!("it is for {}x{} pixels", field.width, field.height);
-        let why = format!("{found}, view '{}' has {}x{}", views.name(position), camera.width, camera.height);
+    if tracks.size() != size {
+        let found = format!("it is for {}x{} pixels", tracks.size().0, tracks.size().1);
+        let why = format!("{found}, view '{}' has {}x{}", views.name(position), size.0, size.1);
         return Err(CliError::bad_input(file.display(), format!("{why}; track the images as they are")));
     }
-    Ok(fields)
+    Ok(tracks)
 }
 
 impl Mean {

@@ -7,7 +7,7 @@ use indicatif::ProgressBar;
 use rayon::prelude::*;
 use splat::{
     formats::track_npz::TrackNpzWriter,
-    tracking::{TrackField, TrackingSettings},
+    tracking::{TrackField, Tracker, TrackingSettings},
 };
 
 use crate::{
@@ -41,13 +41,14 @@ pub(crate) struct TrackArgs {
 
 pub(super) fn run(args: TrackArgs, logs: &LogArgs) -> Result<(), CliError> {
     let settings = args.tracker.settings()?;
+    let tracker = args.tracker.load(&settings)?;
     let views = ChosenViews::open(&args.views)?;
     let files = files(&args.out, &views)?;
     let later_frames = views.clip().frames().len() - 1;
     let bar = progress(logs, later_frames * views.positions.len());
     let track = |(&position, file): (&usize, &PathBuf)| {
-        let run =
-            ViewRun { views: &views, position, settings: &settings, pictures: args.pictures.as_deref() };
+        let pictures = args.pictures.as_deref();
+        let run = ViewRun { views: &views, position, tracker: &tracker, settings: &settings, pictures };
         run.write(file, &bar)
     };
     views.positions.par_iter().zip(&files).try_for_each(track)?;
@@ -85,6 +86,7 @@ fn files(out: &Path, views: &ChosenViews) -> Result<Vec<PathBuf>, CliError> {
 struct ViewRun<'a> {
     views: &'a ChosenViews,
     position: usize,
+    tracker: &'a Tracker,
     settings: &'a TrackingSettings,
     pictures: Option<&'a Path>,
 }
@@ -103,7 +105,7 @@ impl ViewRun<'_> {
             )),
             None => None,
         };
-        self.views.track(self.position, self.settings, &mut |index, field| {
+        self.views.track(self.position, self.tracker, self.settings, &mut |index, field| {
             writer.push(&field).map_err(failed)?;
             if let Some((folder, trails)) = &mut album {
                 self.draw(folder, trails, index, &field)?;
