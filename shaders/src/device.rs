@@ -284,14 +284,14 @@ impl GpuDevice {
         })
     }
 
-    /// Lets all jobs together take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where
-    /// that is not known, for what the driver grants, which it does not tell before.
+    /// Lets all jobs together take so many bytes at most, and no more than [`DeviceDescription::memory`]; without it, they may ask
+    /// for that, or, where it is not known, for what the driver grants, which it does not tell before.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
-        Self { account: Account::new(Some(bytes)), ..self }
+        Self { account: Account::limited(bytes, self.description.memory), ..self }
     }
 
-    /// Says how long one submission, a step or a pass, may take until the device counts as lost; without it, two minutes, half an
-    /// hour with software.
+    /// Says how long one submission, a step or a pass, may take until the device counts as lost, if nothing else ends meanwhile;
+    /// without it, two minutes, half an hour with software.
     pub fn with_patience(self, patience: Duration) -> Self {
         Self { patience, ..self }
     }
