@@ -4,12 +4,15 @@ mod account;
 mod choice;
 mod health;
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::{Arc, Mutex},
+    time::Duration,
+};
 
 use thiserror::Error;
 use wgpu::{
     Adapter, Backends, Device, DeviceDescriptor, DeviceType, Features, Instance, InstanceDescriptor,
-    InstanceFlags, Limits, MemoryBudgetThresholds, Queue,
+    InstanceFlags, Limits, MemoryBudgetThresholds, Queue, SubmissionIndex,
 };
 
 pub(crate) use self::account::{Account, Reservation};
@@ -233,6 +236,8 @@ pub struct GpuDevice {
     account: Arc<Account>,
     uses_subgroups: bool,
     health: Arc<Health>,
+    /// The upload whose staging buffer may still be in use.
+    pub(crate) uploading: Mutex<Option<SubmissionIndex>>,
     patience: Duration,
     poll: Poll,
 }
@@ -278,6 +283,7 @@ impl GpuDevice {
             limits,
             account: Account::new(description.memory),
             uses_subgroups,
+            uploading: Mutex::default(),
             patience: health::patience(description.kind),
             poll: health::poll,
             description,
