@@ -17,7 +17,7 @@ use splat::{
 use trackersplat_proto::v1::{ExactTracks, SubmitRequest, TrackFiles, submit_request::Tracks};
 
 use crate::{
-    device::{DeviceArg, Placement, gpu_engine, share_of_memory},
+    device::{DeviceArg, Placement, gpu_engine, memories, share_of_memory},
     error::CliError,
     frame_range::FrameRange,
     layers::SettingsLayers,
@@ -237,9 +237,9 @@ pub(crate) struct EngineArgs {
     #[arg(long, value_name = "SET", help_heading = "Execution")]
     pub(crate) instructions: Option<InstructionSet>,
 
-    /// MiB of the GPU's memory that this process takes at most [default: all; workers that this program starts on one GPU divide it].
+    /// MiB of the GPU's memory that a process takes at most [default: all; workers that this program starts on one GPU divide nine tenths].
     ///
-    /// A job that needs more fails as out of resources. For workers of several programs on one GPU whose driver does not say what
+    /// Never more than the GPU has. Where this program starts workers, each of them takes so much: it is not divided. A job that needs more fails as out of resources. For workers of several programs on one GPU whose driver does not say what
     /// the others have.
     #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u32).range(1..), help_heading = "Execution")]
     pub(crate) device_memory: Option<u32>,
@@ -288,25 +288,31 @@ impl EngineArgs {
             }
             Placement::Gpus(gpus) => {
                 let count = asked.unwrap_or(gpus.len());
-                let one = |gpu: &usize| WorkerSetup {
+                // In turn: some may have one more than others.
+                let assigned: Vec<usize> = gpus.iter().copied().cycle().take(count).collect();
+                let is_divided = self.device_memory.is_none() && count > gpus.len();
+                let memories = if is_divided { memories() } else { Vec::new() };
+                let one = |&gpu: &usize| WorkerSetup {
                     threads: (cores / count).max(1),
                     arguments: [
                         Some(format!("--device=gpu:{gpu}")),
-                        self.memory_of_a_worker(*gpu, count.div_ceil(gpus.len())),
+                        self.memory_of_a_worker(gpu, &assigned, &memories),
                     ]
                     .into_iter()
                     .flatten()
                     .collect(),
                 };
-                gpus.iter().cycle().take(count).map(one).collect()
+                assigned.iter().map(one).collect()
             }
         }
     }
 
-    /// What a worker is told of its GPU's memory, one of so many on it.
-    fn memory_of_a_worker(&self, gpu: usize, workers: usize) -> Option<String> {
-        let shared = || if workers > 1 { share_of_memory(gpu, workers) } else { None };
-        let mebibytes = self.device_memory.map(u64::from).or_else(shared)?;
+    /// What a worker is told of its GPU's memory; `assigned` are the GPUs of all of them, `memories` those of all devices.
+    fn memory_of_a_worker(&self, gpu: usize, assigned: &[usize], memories: &[Option<u64>]) -> Option<String> {
+        let workers = assigned.iter().filter(|&&other| other == gpu).count();
+        let memory = memories.get(gpu).copied().flatten().filter(|_| workers > 1);
+        let share = memory.map(|bytes| share_of_memory(bytes, workers));
+        let mebibytes = self.device_memory.map(u64::from).or(share)?;
         Some(format!("--device-memory={mebibytes}"))
     }
 
@@ -421,6 +427,20 @@ mod tests {
         assert_eq!(arguments(&cpu), ["--device=cpu"; 3]);
         assert_eq!(cpu[0].threads, 1);
         assert_eq!(args.workers(&Placement::Cpu, Some(5), 3, 16).len(), 5);
+    }
+
+    #[test]
+    fn workers_divide_the_gpu_that_they_are_on() {
+        let memories = [Some(10 << 30), Some(20 << 30), None];
+        let args = EngineArgs::default();
+        let told = |gpu, assigned: &[usize]| args.memory_of_a_worker(gpu, assigned, &memories);
+        // Three workers on two GPUs: one has its GPU for itself.
+        assert_eq!(told(1, &[1, 0, 1]).as_deref(), Some("--device-memory=9216"));
+        assert_eq!(told(0, &[1, 0, 1]), None);
+        assert_eq!(told(2, &[2, 2]), None, "nobody knows how much there is");
+        let explicit = EngineArgs { device_memory: Some(512), ..EngineArgs::default() };
+        let told = explicit.memory_of_a_worker(1, &[1, 1], &memories);
+        assert_eq!(told.as_deref(), Some("--device-memory=512"), "for each of them");
     }
 
     #[test]

@@ -99,10 +99,10 @@ impl EmbeddedRun<'_> {
             return Ok((None, None));
         };
         let submitted = submitted?.into_inner();
-        let device = self.engine.device_name().unwrap_or(self.engine.name());
+        // Not its device, which may not be open yet: results name theirs.
         tracing::info!(
             address,
-            device,
+            engine = self.engine.name(),
             job_id = submitted.job_id,
             resumed = submitted.resumed,
             "coordinator"

@@ -4,12 +4,15 @@ mod account;
 mod choice;
 mod health;
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::{Arc, Mutex},
+    time::Duration,
+};
 
 use thiserror::Error;
 use wgpu::{
     Adapter, Backends, Device, DeviceDescriptor, DeviceType, Features, Instance, InstanceDescriptor,
-    InstanceFlags, Limits, MemoryBudgetThresholds, Queue,
+    InstanceFlags, Limits, MemoryBudgetThresholds, Queue, SubmissionIndex,
 };
 
 pub(crate) use self::account::{Account, Reservation};
@@ -233,6 +236,8 @@ pub struct GpuDevice {
     account: Arc<Account>,
     uses_subgroups: bool,
     health: Arc<Health>,
+    /// The upload whose staging buffer may still be in use.
+    pub(crate) uploading: Mutex<Option<SubmissionIndex>>,
     patience: Duration,
     poll: Poll,
 }
@@ -278,20 +283,21 @@ impl GpuDevice {
             limits,
             account: Account::new(description.memory),
             uses_subgroups,
+            uploading: Mutex::default(),
             patience: health::patience(description.kind),
             poll: health::poll,
             description,
         })
     }
 
-    /// Lets all jobs together take so many bytes at most; without it, they may ask for [`DeviceDescription::memory`], or, where
-    /// that is not known, for what the driver grants, which it does not tell before.
+    /// Lets all jobs together take so many bytes at most, and no more than [`DeviceDescription::memory`]; without it, they may ask
+    /// for that, or, where it is not known, for what the driver grants, which it does not tell before.
     pub fn with_memory_limit(self, bytes: u64) -> Self {
-        Self { account: Account::new(Some(bytes)), ..self }
+        Self { account: Account::limited(bytes, self.description.memory), ..self }
     }
 
-    /// Says how long one submission, a step or a pass, may take until the device counts as lost; without it, two minutes, half an
-    /// hour with software.
+    /// Says how long one submission, a step or a pass, may take until the device counts as lost, if nothing else ends meanwhile;
+    /// without it, two minutes, half an hour with software.
     pub fn with_patience(self, patience: Duration) -> Self {
         Self { patience, ..self }
     }

@@ -139,10 +139,11 @@ impl GpuEngine {
     ) -> Result<Buffers, EngineError> {
         let device = &self.context.device;
         let size = self.size(gaussians.len(), gaussians.sh_coefficients(), view, has_gradient)?;
+        admit(device, &Buffers::requests(&size))?;
         Buffers::new(device, ParameterBuffers::new(device, gaussians)?, &size)
     }
 
-    /// What [`GpuEngine::buffers`] takes, if the device would grant it.
+    /// What [`GpuEngine::buffers`] takes.
     pub(crate) fn size(
         &self,
         count: usize,
@@ -157,16 +158,14 @@ impl GpuEngine {
             return Err(EngineError::OutOfResources { needed, available: device.max_buffer() });
         }
         let (count, tiles) = (count as u64, view.tile_count().into());
-        let size = Size {
+        Ok(Size {
             count,
             coefficients: coefficients as u64,
             pixels: view.pixels(),
             tiles,
             capacity: first_capacity(count, tiles),
             has_gradient,
-        };
-        admit(device, &Buffers::requests(&size))?;
-        Ok(size)
+        })
     }
 
     /// Stages 1 to 3, with more room until there is enough.

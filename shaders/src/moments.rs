@@ -15,7 +15,10 @@ use splat::{
 };
 
 use crate::{
-    buffers::{Buffers, MomentBuffers, ParameterBuffers, Size, admit, parameters::check_lengths},
+    buffers::{
+        Buffers, MomentBuffers, ParameterBuffers, Size, admit, admit_instead, parameters::check_lengths,
+        total,
+    },
     device::GpuDevice,
     engine::{Context, GpuEngine},
     layout::{Expectation, Moments, View},
@@ -42,8 +45,7 @@ pub(crate) fn footprint_moments(
 ) -> Result<Vec<FootprintMoments>, EngineError> {
     let device = &engine.context.device;
     let view = ViewBuffer::new(device, View::new(camera, [0.0; 3]))?;
-    let size = engine.size(gaussians.len(), 1, &view.data, false)?;
-    let measured = engine.context.measured.take_over(device, gaussians)?;
+    let (measured, size) = taken_over(engine, gaussians, &view.data)?;
     let buffers = Buffers::new(device, measured.parameters.clone(), &size)?;
     let (buffers, intersections) =
         engine
@@ -59,6 +61,21 @@ pub(crate) fn footprint_moments(
         reweighting.apply(&mut moments, |expected| measurement.reweighted(gaussians.len(), expected))?;
     }
     Ok(moments)
+}
+
+/// A set on the device, and what a view of it takes, for which there is room.
+pub(crate) fn taken_over(
+    engine: &GpuEngine,
+    gaussians: &Gaussians,
+    view: &View,
+) -> Result<(Arc<Measured>, Size), EngineError> {
+    let device = &engine.context.device;
+    let size = engine.size(gaussians.len(), 1, view, false)?;
+    let measured = engine.context.measured.take_over(device, gaussians)?;
+    // By now its parameters are held.
+    let parameters = total(&ParameterBuffers::requests(size.count, size.coefficients));
+    admit_instead(device, &Buffers::requests(&size), parameters)?;
+    Ok((measured, size))
 }
 
 /// The first pass: every footprint, as it is.

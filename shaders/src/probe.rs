@@ -69,6 +69,10 @@ impl Probe {
     /// Takes one step on the first view of `input`, so that every buffer has the room it needs, and binds the stages;
     /// `tracks` are of that view.
     pub fn new(engine: &GpuEngine, input: SessionInput, tracks: &TrackField) -> Result<Self, EngineError> {
+        engine.context.device.guarded(|| Self::bound(engine, input, tracks))
+    }
+
+    fn bound(engine: &GpuEngine, input: SessionInput, tracks: &TrackField) -> Result<Self, EngineError> {
         let context = Arc::clone(&engine.context);
         let (count, sh_degree) = (input.gaussians.len(), input.gaussians.sh_degree);
         let rates = LearningRates {
@@ -97,13 +101,17 @@ impl Probe {
 
     /// Intersections of footprints with tiles.
     pub fn intersections(&self) -> Result<u32, EngineError> {
-        let (buffers, _) = self.session.first_view();
-        Ok(read::<State>(&self.context.device, &buffers.common.state, 1)?[0].needed)
+        let ((buffers, _), device) = (self.session.first_view(), &self.context.device);
+        device.guarded(|| Ok(read::<State>(device, &buffers.common.state, 1)?[0].needed))
     }
 
     /// Runs a stage so many times, 1 to 128, and waits for the last. Seconds of each by the device's own clock, where it has
     /// one; else nothing, and the caller's clock over all of them has to do.
     pub fn run(&self, stage: Stage, times: u32) -> Result<Option<Vec<f64>>, EngineError> {
+        self.context.device.guarded(|| self.timed(stage, times))
+    }
+
+    fn timed(&self, stage: Stage, times: u32) -> Result<Option<Vec<f64>>, EngineError> {
         let device = &self.context.device;
         let times = times.clamp(1, MOST);
         let program = &self.programs[stage as usize];

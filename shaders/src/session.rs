@@ -209,6 +209,14 @@ impl GpuSession {
         self.submitted.iter().try_for_each(|step| device.wait(Some(step.submission.clone())))
     }
 
+    /// Waits until few of the steps before the one at `place` are at work.
+    fn leave_few_before(&self, place: usize) -> Result<(), EngineError> {
+        match place.checked_sub(IN_FLIGHT).and_then(|earlier| self.submitted.get(earlier)) {
+            Some(earlier) => self.context.device.wait(Some(earlier.submission.clone())),
+            None => Ok(()),
+        }
+    }
+
     /// Makes every later step one that the device refuses.
     #[cfg(test)]
     pub(crate) fn break_buffers(&self) {
@@ -247,6 +255,7 @@ impl GpuSession {
             }
             self.bind();
             for place in 0..self.submitted.len() {
+                self.leave_few_before(place)?;
                 let Submitted { view, rates, number, .. } = self.submitted[place].clone();
                 self.submitted[place].submission = self.submit(view, &rates, number, place);
             }
@@ -334,9 +343,7 @@ impl Session for GpuSession {
             if session.submitted.len() == REMEMBERED {
                 session.settle()?;
             }
-            if let Some(earlier) = session.submitted.iter().rev().nth(IN_FLIGHT - 1) {
-                session.context.device.wait(Some(earlier.submission.clone()))?;
-            }
+            session.leave_few_before(session.submitted.len())?;
             session.steps += 1;
             let number = session.steps;
             let submission = session.submit(view, rates, number, session.submitted.len());
@@ -407,7 +414,8 @@ fn twice(size: &Size) -> Request {
 impl Drop for GpuSession {
     fn drop(&mut self) {
         // Buffers that a device is at work on are not freed with their last owner. A device that is lost has nothing to free.
-        let _ = self.wait().and_then(|()| self.context.device.wait(None));
+        let _ = self.wait();
+        let _ = self.context.device.wait(None);
     }
 }
 

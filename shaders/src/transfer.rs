@@ -1,6 +1,9 @@
 //! Bringing values to the device and back to the host, a bounded part at a time: what is in transit takes memory of its own.
 
-use std::{sync::mpsc::RecvTimeoutError, time::Duration};
+use std::{
+    sync::{PoisonError, mpsc::RecvTimeoutError},
+    time::Duration,
+};
 
 use bytemuck::{Pod, cast_slice};
 use splat::engine::EngineError;
@@ -32,11 +35,15 @@ fn write_in_parts(device: &GpuDevice, target: &Buffer, bytes: &[u8], part: usize
             .map_err(|error| failed(error.to_string()))?
             .copy_from_slice(bytes);
         staging.unmap();
+        // While this part was copied here, the device may have been at work on the one before: two at a time.
+        let earlier = device.uploading.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(earlier) = earlier {
+            device.wait(Some(earlier))?;
+        }
         let mut encoder = device.device.create_command_encoder(&Default::default());
         encoder.copy_buffer_to_buffer(&staging, 0, target, (number * part) as u64, size);
         let submission = device.queue.submit([encoder.finish()]);
-        // So that it is freed before the next.
-        device.wait(Some(submission))?;
+        *device.uploading.lock().unwrap_or_else(PoisonError::into_inner) = Some(submission);
     }
     Ok(())
 }
@@ -123,6 +130,19 @@ mod tests {
         buffers::{allocate, storage},
         tests::support,
     };
+
+    #[test]
+    fn only_a_second_upload_waits_for_the_first() {
+        if support::engine().is_none() {
+            return;
+        }
+        let device = support::open().with_poll(|_, _| Err(wgpu::PollError::Timeout));
+        let values = vec![7_u32; SMALL];
+        let [buffer] = allocate(&device, [storage("values", 4 * SMALL as u64)]).unwrap();
+        write(&device, &buffer, &values).unwrap();
+        let outcome = write(&device, &buffer, &values);
+        assert!(matches!(outcome, Err(EngineError::DeviceLost(_))), "{outcome:?}");
+    }
 
     #[test]
     fn values_in_parts_come_back_as_they_went() {

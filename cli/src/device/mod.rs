@@ -114,10 +114,15 @@ fn open(choice: &DeviceChoice, memory: Option<u64>) -> Result<Arc<dyn Engine>, E
     Ok(Arc::new(GpuEngine::new(device)?))
 }
 
-/// What each of so many processes may take of a GPU's memory, MiB; `None` where nobody knows how much there is.
-pub(crate) fn share_of_memory(gpu: usize, processes: usize) -> Option<u64> {
-    let bytes = devices().get(gpu)?.memory?;
-    Some((bytes / processes.max(1) as u64) >> 20)
+/// Memory of every device of this machine, bytes, by their numbers; `None` where nobody knows.
+pub(crate) fn memories() -> Vec<Option<u64>> {
+    devices().iter().map(|device| device.memory).collect()
+}
+
+/// What each of so many processes may take of a GPU's memory, MiB: nine tenths of it are divided, the rest is for what drivers take for
+/// each process.
+pub(crate) fn share_of_memory(bytes: u64, processes: usize) -> u64 {
+    (bytes / 10 * 9 / processes.max(1) as u64) >> 20
 }
 
 #[cfg(test)]
@@ -145,6 +150,15 @@ mod tests {
         let error = unknown.placement().unwrap_err();
         assert_eq!(error.exit_code(), 3);
         assert!(error.to_string().contains("this machine has"), "{error}");
+    }
+
+    #[test]
+    fn processes_on_one_gpu_leave_a_tenth_of_it() {
+        let gibibytes = |number: u64| number << 30;
+        assert_eq!(share_of_memory(gibibytes(80), 1), 73_728);
+        assert_eq!(share_of_memory(gibibytes(80), 3), 24_576);
+        assert_eq!(share_of_memory(gibibytes(10), 0), 9216);
+        assert_eq!(share_of_memory(u64::MAX, 1), (u64::MAX / 10 * 9) >> 20);
     }
 
     #[test]

@@ -50,8 +50,12 @@ impl ReopeningEngine {
         // Its memory is free before the device is asked for the same again.
         *current = None;
         tracing::warn!(device = self.device_name(), lost, "opening the device again");
-        self.open_first(&mut current)
-            .map_err(|error| EngineError::DeviceLost(format!("{lost}; opening it again: {error}")))
+        self.open_first(&mut current).map_err(|error| match error {
+            EngineError::DeviceLost(error) => {
+                EngineError::DeviceLost(format!("{lost}; opening it again: {error}"))
+            }
+            other => other,
+        })
     }
 
     /// Opens the chosen device, or chooses the first that opens.
@@ -68,13 +72,26 @@ impl ReopeningEngine {
                 }
                 Err(error) => {
                     tracing::warn!(device = candidate.name, %error, "the device does not open");
-                    refusals.push(error.to_string());
+                    refusals.push(error);
                 }
             }
         }
-        let refusals = refusals.join("; ");
-        Err(EngineError::DeviceLost(format!("{refusals}; --device cpu does without a GPU")))
+        Err(refused(refusals))
     }
+}
+
+/// What the refusals of all candidates come to: the last if all are bugs or all want of memory, which another attempt does not
+/// mend; else no device is there.
+fn refused(mut refusals: Vec<EngineError>) -> EngineError {
+    let are_bugs = refusals.iter().all(|error| matches!(error, EngineError::Internal(_)));
+    let want_memory = refusals.iter().all(|error| matches!(error, EngineError::OutOfResources { .. }));
+    if (are_bugs || want_memory)
+        && let Some(last) = refusals.pop()
+    {
+        return last;
+    }
+    let refusals: Vec<_> = refusals.iter().map(EngineError::to_string).collect();
+    EngineError::DeviceLost(format!("{}; --device cpu does without a GPU", refusals.join("; ")))
 }
 
 impl Engine for ReopeningEngine {
@@ -236,6 +253,19 @@ mod tests {
         bus.is_dead.store(false, SeqCst);
         engine.check().unwrap();
         assert_eq!(bus.opened.load(SeqCst), 2);
+    }
+
+    #[test]
+    fn refusals_of_one_kind_keep_their_kind() {
+        let bug = || EngineError::Internal("a kernel".into());
+        let memory = || EngineError::OutOfResources { needed: 2, available: 1 };
+        assert!(matches!(refused(vec![bug(), bug()]), EngineError::Internal(_)));
+        assert!(matches!(refused(vec![memory()]), EngineError::OutOfResources { needed: 2, .. }));
+        for mixed in
+            [vec![bug(), memory()], vec![memory(), EngineError::DeviceLost("gone".into())], Vec::new()]
+        {
+            assert!(matches!(refused(mixed), EngineError::DeviceLost(_)));
+        }
     }
 
     #[test]

@@ -46,11 +46,13 @@ impl Job {
 
     async fn reconstruct_static_model(&mut self) -> Result<Artifact, StageError> {
         let clip = self.clip().await?;
+        let engine = self.hub.engine.clone();
+        let engine_key = self.hub.compute.run(move || opened_key(engine.as_ref())).await?;
         let training = clip.views().iter().filter(|view| view.split == Split::Train);
         let key = digest_of(&StaticModelKey {
             kind: "static model",
             version: VERSION,
-            engine: &engine_key(self.hub.engine.as_ref()),
+            engine: &engine_key,
             clip: &self.record.clip_digest,
             key_frame: self.key_frame(),
             training_views: training.map(|view| view.name.as_str()).collect(),
@@ -104,6 +106,12 @@ impl Job {
         let Some(artifact) = self.hub.store.artifact(key).await? else { return Ok(None) };
         Ok(self.hub.blobs.holds(&artifact.blob).await.then_some(artifact))
     }
+}
+
+/// The key of the engine's device, once it is open: which of several opens is not known before.
+fn opened_key(engine: &dyn Engine) -> Result<String, StageError> {
+    engine.check()?;
+    Ok(engine_key(engine))
 }
 
 /// A second attempt where the device was lost in the first one and came back.
@@ -168,9 +176,59 @@ fn input(clip: &Clip, settings: &Settings) -> Result<StaticModelInput, StageErro
 
 #[cfg(test)]
 mod tests {
-    use splat::raster::CpuEngine;
+    use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
+
+    use splat::{
+        cameras::Camera,
+        engine::{Rendering, Session, SessionInput},
+        motion::{moments::FootprintMoments, reweighting::Reweighting},
+        raster::CpuEngine,
+        tracking::TrackField,
+    };
 
     use super::*;
+
+    /// Its first device does not open, which it finds out when it is asked.
+    #[derive(Default)]
+    struct Lazy(AtomicBool);
+
+    impl Engine for Lazy {
+        fn name(&self) -> &str {
+            "gpu"
+        }
+
+        fn device_name(&self) -> Option<&str> {
+            Some(if self.0.load(SeqCst) { "Card B" } else { "Card A" })
+        }
+
+        fn check(&self) -> Result<(), EngineError> {
+            self.0.store(true, SeqCst);
+            Ok(())
+        }
+
+        fn render(&self, _: &Gaussians, _: &Camera, _: [f32; 3]) -> Result<Rendering, EngineError> {
+            unreachable!("nobody asked")
+        }
+
+        fn footprint_moments(
+            &self,
+            _: &Gaussians,
+            _: &Camera,
+            _: &TrackField,
+            _: Option<&Reweighting>,
+        ) -> Result<Vec<FootprintMoments>, EngineError> {
+            unreachable!("nobody asked")
+        }
+
+        fn session(&self, _: SessionInput) -> Result<Box<dyn Session>, EngineError> {
+            unreachable!("nobody asked")
+        }
+    }
+
+    #[test]
+    fn the_key_names_the_device_that_opened() {
+        assert_eq!(opened_key(&Lazy::default()).ok().as_deref(), Some("gpu Card B"));
+    }
 
     fn lost<T>() -> Result<T, StaticModelError> {
         Err(StaticModelError::Engine(EngineError::DeviceLost("off the bus".into())))

@@ -54,7 +54,7 @@ pub(crate) struct ParameterBuffers {
 }
 
 impl ParameterBuffers {
-    pub(super) fn requests(count: u64, coefficients: u64) -> [Request; 2] {
+    pub(crate) fn requests(count: u64, coefficients: u64) -> [Request; 2] {
         [storage("geometry", 4 * GEOMETRY as u64 * count), storage("sh", 12 * coefficients * count)]
     }
 

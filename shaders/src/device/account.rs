@@ -1,6 +1,6 @@
 //! What a device has to give, and what is held of it.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use splat::engine::EngineError;
 
@@ -9,7 +9,14 @@ use splat::engine::EngineError;
 pub(crate) struct Account {
     /// `None` where nobody knows.
     limit: Option<u64>,
-    held: Mutex<u64>,
+    taken: Mutex<Taken>,
+}
+
+#[derive(Debug, Default)]
+struct Taken {
+    held: u64,
+    /// What was held, and with it what was asked for last: what a refusal of the driver is about.
+    last_asked: u64,
 }
 
 /// Bytes that are taken from an [`Account`], and go back to it when this is dropped.
@@ -21,12 +28,26 @@ pub(crate) struct Reservation {
 
 impl Account {
     pub(crate) fn new(limit: Option<u64>) -> Arc<Self> {
-        Arc::new(Self { limit, held: Mutex::new(0) })
+        Arc::new(Self { limit, taken: Mutex::default() })
+    }
+
+    /// Of at most so many bytes, of a device that has `memory`, where that is known.
+    pub(crate) fn limited(bytes: u64, memory: Option<u64>) -> Arc<Self> {
+        Self::new(Some(memory.map_or(bytes, |memory| memory.min(bytes))))
     }
 
     /// Bytes that are taken.
     pub(crate) fn held(&self) -> u64 {
-        *self.held.lock().unwrap_or_else(PoisonError::into_inner)
+        self.taken().held
+    }
+
+    /// Bytes that were taken when somebody last asked for some, those included.
+    pub(crate) fn last_asked(&self) -> u64 {
+        self.taken().last_asked
+    }
+
+    fn taken(&self) -> MutexGuard<'_, Taken> {
+        self.taken.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether so many bytes are there once `returned` of those that are taken have come back.
@@ -36,9 +57,10 @@ impl Account {
 
     /// Takes so many bytes, or none.
     pub(crate) fn reserve(self: &Arc<Self>, bytes: u64) -> Result<Reservation, EngineError> {
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
-        self.check(bytes, *held)?;
-        *held = held.saturating_add(bytes);
+        let mut taken = self.taken();
+        taken.last_asked = taken.held.saturating_add(bytes);
+        self.check(bytes, taken.held)?;
+        taken.held = taken.last_asked;
         Ok(Reservation { account: Arc::clone(self), bytes })
     }
 
@@ -62,8 +84,8 @@ impl Reservation {
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        let mut held = self.account.held.lock().unwrap_or_else(PoisonError::into_inner);
-        *held = held.saturating_sub(self.bytes);
+        let mut taken = self.account.taken();
+        taken.held = taken.held.saturating_sub(self.bytes);
     }
 }
 
@@ -88,8 +110,16 @@ mod tests {
         assert!(account.admit(36, 0).is_err());
         account.admit(36, 1).unwrap();
         drop((part, second));
-        assert_eq!(account.held(), 0);
+        assert_eq!((account.held(), account.last_asked()), (0, 100), "what was asked for stays known");
         account.admit(100, 0).unwrap();
+    }
+
+    #[test]
+    fn nobody_is_promised_more_than_the_device_has() {
+        let limit = |bytes, memory| Account::limited(bytes, memory).limit;
+        assert_eq!(limit(70, Some(100)), Some(70));
+        assert_eq!(limit(170, Some(100)), Some(100));
+        assert_eq!(limit(170, None), Some(170));
     }
 
     #[test]

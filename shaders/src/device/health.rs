@@ -1,7 +1,12 @@
 //! What goes wrong on a device, and for whom: a lost device is lost for everybody, all else fails the work that it happens in.
 
 use std::{
-    sync::{Arc, Mutex, PoisonError},
+    any::Any,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering::Relaxed},
+    },
     time::Duration,
 };
 
@@ -19,20 +24,13 @@ const PATIENCE_WITH_SOFTWARE: Duration = Duration::from_secs(1800);
 /// How a device is waited for.
 pub(super) type Poll = fn(&Device, PollType) -> Result<PollStatus, PollError>;
 
-/// Why a device is gone.
-#[derive(Clone, Debug)]
-enum Loss {
-    /// The driver had no memory where it cannot do without.
-    Memory,
-    Other(String),
-}
-
 /// What happened on a device outside of the calls that return errors.
 #[derive(Debug, Default)]
 pub(super) struct Health {
-    lost: Mutex<Option<Loss>>,
-    /// What broke a rule outside of [`GpuDevice::guarded`].
-    stray: Mutex<Option<String>>,
+    /// Why the device is gone.
+    lost: Mutex<Option<String>>,
+    /// How many waits have ended: as long as this grows, the device works.
+    ended: AtomicU64,
 }
 
 impl Health {
@@ -40,31 +38,15 @@ impl Health {
     pub(super) fn of(device: &Device) -> Arc<Self> {
         let health = Arc::new(Self::default());
         let lost = Arc::clone(&health);
-        device.set_device_lost_callback(move |_, message| lost.lose(Loss::said(message)));
-        let failed = Arc::clone(&health);
-        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
-            let mut stray = failed.stray.lock().unwrap_or_else(PoisonError::into_inner);
-            stray.get_or_insert(error.to_string());
-        }));
+        device.set_device_lost_callback(move |_, message| lost.lose(message));
+        // What has a result runs in `GpuDevice::guarded`, which collects what it broke. What is left belongs to nobody who could
+        // fail by it, and wgpu's own answer to it is a panic.
+        device.on_uncaptured_error(Arc::new(|_| {}));
         health
     }
 
-    fn lose(&self, loss: Loss) {
-        self.lost.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(loss);
-    }
-
-    fn take_stray(&self) -> Option<String> {
-        self.stray.lock().unwrap_or_else(PoisonError::into_inner).take()
-    }
-}
-
-impl Loss {
-    /// As the driver's layer words it.
-    fn said(message: String) -> Self {
-        match message {
-            message if message == wgpu::hal::DeviceError::OutOfMemory.to_string() => Self::Memory,
-            message => Self::Other(message),
-        }
+    fn lose(&self, why: String) {
+        self.lost.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(why);
     }
 }
 
@@ -85,39 +67,57 @@ impl GpuDevice {
         let lost = self.health.lost.lock().unwrap_or_else(PoisonError::into_inner).clone();
         match lost {
             None => Ok(()),
-            Some(Loss::Memory) => Err(self.out_of_memory()),
-            Some(Loss::Other(why)) => {
-                Err(EngineError::DeviceLost(format!("{}: {why}", self.description.name)))
-            }
+            Some(why) => Err(EngineError::DeviceLost(format!("{}: {why}", self.description.name))),
         }
     }
 
-    /// Waits for a submission and all before it, or for all there are; the device is lost if one takes longer than it may.
+    /// Waits for a submission and all before it, or for all there are. The device is lost if it takes longer than it may and nothing
+    /// else that somebody waited for has ended meanwhile: the queue is everybody's.
     pub(crate) fn wait(&self, submission: Option<SubmissionIndex>) -> Result<(), EngineError> {
         self.check()?;
         let until = PollType::Wait { submission_index: submission, timeout: Some(self.patience) };
-        match (self.poll)(&self.device, until) {
-            Ok(_) => {}
-            Err(PollError::Timeout) => self.give_up(),
-            Err(error @ PollError::WrongSubmissionIndex(..)) => {
-                self.check()?;
-                return Err(EngineError::Internal(format!("the device refused a submission: {error}")));
+        loop {
+            let ended = self.health.ended.load(Relaxed);
+            // wgpu has no error for a device that goes away while somebody waits: it panics. The device is not used any more.
+            let polled = catch_unwind(AssertUnwindSafe(|| (self.poll)(&self.device, until.clone())));
+            match polled {
+                Ok(Ok(_)) => {
+                    self.progress();
+                    break;
+                }
+                Ok(Err(PollError::Timeout)) if self.health.ended.load(Relaxed) != ended => {}
+                Ok(Err(PollError::Timeout)) => {
+                    let seconds = self.patience.as_secs_f64();
+                    self.give_up(format!("it hangs: work of one submission is not done after {seconds} s"));
+                    break;
+                }
+                Ok(Err(error @ PollError::WrongSubmissionIndex(..))) => {
+                    self.check()?;
+                    return Err(EngineError::Internal(format!("the device refused a submission: {error}")));
+                }
+                Err(panic) => {
+                    self.give_up(said(panic.as_ref()));
+                    break;
+                }
             }
         }
         self.check()
     }
 
+    /// Something that somebody waited for has ended.
+    pub(crate) fn progress(&self) {
+        self.health.ended.fetch_add(1, Relaxed);
+    }
+
     /// As if the driver had said so.
     #[cfg(test)]
     pub(crate) fn lose(&self, said: &str) {
-        self.health.lose(Loss::said(said.to_owned()));
+        self.health.lose(said.to_owned());
     }
 
     /// Counts the device as lost. To free a queue is to wait for it, so that one which does not end is never freed.
-    fn give_up(&self) {
-        let seconds = self.patience.as_secs_f64();
-        self.health
-            .lose(Loss::Other(format!("it hangs: work of one submission is not done after {seconds} s")));
+    fn give_up(&self, why: String) {
+        self.health.lose(why);
         std::mem::forget::<Queue>(self.queue.clone());
     }
 
@@ -136,20 +136,22 @@ impl GpuDevice {
         // The last one first.
         let [memory, validation, internal] =
             [memory, validation, internal].map(|scope| pollster::block_on(scope.pop()));
-        if memory.is_some() {
-            return Err(self.out_of_memory());
-        }
         // A device that is lost breaks rules by what it cannot do any more.
         self.check()?;
-        let broken = validation.or(internal).map(|error| error.to_string());
-        match broken.or_else(|| self.health.take_stray()) {
-            Some(broken) => Err(EngineError::Internal(broken)),
+        if memory.is_some() {
+            // The driver says that it has no more, not how much it has.
+            return Err(EngineError::OutOfResources { needed: self.account.last_asked(), available: 0 });
+        }
+        match validation.or(internal) {
+            Some(broken) => Err(EngineError::Internal(broken.to_string())),
             None => outcome,
         }
     }
+}
 
-    /// The driver says that it has no more than what is held, not how much it has.
-    fn out_of_memory(&self) -> EngineError {
-        EngineError::OutOfResources { needed: self.account.held(), available: 0 }
-    }
+/// The words of a panic.
+fn said(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<String>().cloned();
+    text.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned()))
+        .unwrap_or_else(|| "the driver's layer gave up".to_owned())
 }

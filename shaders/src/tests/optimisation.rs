@@ -17,11 +17,13 @@ use super::{
 };
 use crate::{
     GpuEngine,
-    buffers::{GradientBuffers, LossBuffers, OptimiserBuffers, parameters::interleaved, separated},
+    buffers::{
+        GradientBuffers, LossBuffers, OptimiserBuffers, allocate, parameters::interleaved, separated, storage,
+    },
     layout::{GEOMETRY, State, Step, View},
     session::{SessionView, session_view},
     stages::Binder,
-    transfer::read,
+    transfer::{read, write},
 };
 
 /// Values about and beyond [0, 1].
@@ -185,4 +187,29 @@ pub(super) fn check_descent(engine: &GpuEngine, count: usize, degree: u32, seed:
     assert!(close(found.log_scales.as_flattened(), expected.log_scales.as_flattened()));
     assert!(close(&found.logit_opacities, &expected.logit_opacities));
     assert!(close(&found.sh, &expected.sh));
+}
+
+#[test]
+fn more_values_than_one_row_of_workgroups_are_all_taken_over() {
+    let Some(engine) = support::engine() else { return };
+    let context = &*engine.context;
+    let device = &context.device;
+    // 65 535 workgroups of 256 threads are a row; Adam's are counted by the same two functions.
+    let (count, width) = (349_530_usize, 48_usize);
+    assert!(count * width > 65_535 * 256);
+    let bytes = 4 * (count * width) as u64;
+    let [sources, old, new] = allocate(
+        device,
+        [storage("sources", 4 * count as u64), storage("old", bytes), storage("new", bytes)],
+    )
+    .unwrap();
+    let values: Vec<f32> = (0..count * width).map(|place| (place % 9_999_991) as f32).collect();
+    let backwards: Vec<u32> = (0..count as u32).rev().collect();
+    write(device, &old, &values).unwrap();
+    write(device, &sources, &backwards).unwrap();
+    let binder = Binder { device, kernels: &context.kernels };
+    run(context, &[binder.replace(&sources, &old, &new, count as u64, width as u64).unwrap()]);
+    let found: Vec<f32> = read(device, &new, count * width).unwrap();
+    let expected = backwards.iter().flat_map(|&row| &values[row as usize * width..][..width]);
+    assert!(found.iter().eq(expected));
 }

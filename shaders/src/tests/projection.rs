@@ -34,6 +34,14 @@ pub(super) fn reference(gaussians: &Gaussians, index: usize, camera: &Camera) ->
     }
 }
 
+impl Reference {
+    /// What a pixel's centre sees of it.
+    pub(super) fn alpha(&self, at: DVec2) -> f64 {
+        let offset = at - self.mean;
+        self.opacity * (-0.5 * offset.dot(self.covariance.inverse() * offset)).exp()
+    }
+}
+
 /// Needles of aspect ratios to 1e4 among the others.
 fn needles(seed: u64) -> Gaussians {
     let mut gaussians = blobs(400, 0, seed);
@@ -126,13 +134,11 @@ fn every_tile_with_a_pixel_in_reach_is_listed_nearest_first_and_few_others() {
 
 /// Whether the alpha of a pixel of the tile reaches the threshold.
 fn reaches(reference: &Reference, corner: [u32; 2], size: [u32; 2]) -> bool {
-    let inverse = reference.covariance.inverse();
     let [columns, rows] = [0, 1].map(|axis| corner[axis]..(corner[axis] + TILE).min(size[axis]));
     rows.into_iter().any(|y| {
         columns.clone().any(|x| {
-            let offset = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5) - reference.mean;
-            let exponent = 0.5 * offset.dot(inverse * offset);
-            reference.opacity * (-exponent).exp() >= f64::from(raster::ALPHA_MIN)
+            let at = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            reference.alpha(at) >= f64::from(raster::ALPHA_MIN)
         })
     })
 }
