@@ -41,7 +41,7 @@ pub struct TrackingSettings {
     pub consistency: f32,
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
     pub correlation: f32,
-    /// Standard deviation that no track goes below, pixels; above 0, default 0.04.
+    /// Standard deviation that no track goes below, pixels; above 0, default 0.028.
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
     pub hidden_sigma: f32,
@@ -73,7 +73,7 @@ impl TrackingSettings {
             smoothing_iterations: 10,
             consistency: 1.5,
             correlation: 0.5,
-            sigma_floor: 0.04,
+            sigma_floor: 0.028,
             hidden_sigma: 16.0,
             onnx: OnnxSettings::default(),
         };

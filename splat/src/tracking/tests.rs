@@ -167,7 +167,8 @@ fn jumps_larger_than_the_object_are_followed_and_what_they_cover_is_hidden() {
 
         let covered =
             pixels().filter(|&(_, x, y)| within(x, y, corner, 2.0) && !within(x, y, corners[0], -6.0));
-        assert!(fraction(covered.map(|(i, ..)| field.visible[i])) < 0.03);
+        let seen = fraction(covered.map(|(i, ..)| field.visible[i]));
+        assert!(seen < 0.03, "{seen}");
 
         let wall: Vec<usize> = pixels()
             .filter(|&(_, x, y)| !within(x, y, corner, -8.0) && !within(x, y, corners[0], -8.0))
