@@ -1,6 +1,6 @@
 //! Which track fields of a job there are, and which are still to be made: pure data, kept by the hub.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use trackersplat_proto::v1::{Blob, Failure, TrackFrame, TrackJob, TrackedField, Tracker};
 
@@ -16,6 +16,8 @@ pub(crate) struct TrackLedger {
     /// Fields that are there, and all.
     counts: (u64, u64),
     failed: Option<Failure>,
+    /// Positions and frames of fields that another job was first to make.
+    adopted: BTreeSet<(u32, u32)>,
 }
 
 /// One view and its fields.
@@ -58,7 +60,7 @@ impl TrackLedger {
         let fields = || views.values().flat_map(|view| &view.fields);
         let held = fields().filter(|field| field.tracks.is_some()).count();
         let counts = (held as u64, fields().count() as u64);
-        Self { job, tracker, key_frame, views, counts, failed: None }
+        Self { job, tracker, key_frame, views, counts, failed: None, adopted: BTreeSet::new() }
     }
 
     /// Positions of the views, complete or not.
@@ -95,7 +97,8 @@ impl TrackLedger {
     }
 
     /// Where a field belongs; `None` if this very field is there already. Refuses a frame that the job does not have, and
-    /// a second field that differs from the first: tracks are a function of the images and the tracker.
+    /// a second field that differs from the first: tracks are a function of the images and the tracker. Beside a field of
+    /// another job any other is left aside.
     pub(crate) fn place(&self, position: u32, found: &TrackedField) -> Result<Option<Place>, String> {
         let field = self.field(position, found.frame).ok_or_else(|| {
             format!("tracks of view '{}' to frame {}: not of the job", self.name(position), found.frame)
@@ -104,6 +107,7 @@ impl TrackLedger {
         match &field.tracks {
             None => Ok(Some(Place { key: field.key.clone(), size: self.views[&position].size })),
             Some(known) if known == given => Ok(None),
+            Some(_) if self.adopted.contains(&(position, found.frame)) => Ok(None),
             Some(known) => Err(format!(
                 "tracks of view '{}' to frame {}: blob {} where {} was reported before",
                 self.name(position),
@@ -124,6 +128,12 @@ impl TrackLedger {
         }
     }
 
+    /// Another job was first to make a field: its field counts here too.
+    pub(crate) fn adopt(&mut self, position: u32, frame: u32, tracks: Blob) {
+        self.adopted.insert((position, frame));
+        self.keep(position, &TrackedField { frame, tracks: Some(tracks) });
+    }
+
     /// The first frame to which a view is not tracked.
     pub(crate) fn missing(&self, position: u32) -> Option<u32> {
         let mut fields = self.views.get(&position)?.fields.iter();
@@ -142,12 +152,6 @@ impl TrackLedger {
     /// Fields that are there, and all.
     pub(crate) fn counts(&self) -> (u64, u64) {
         self.counts
-    }
-
-    /// Bytes of the fields that are there.
-    pub(crate) fn bytes(&self) -> u64 {
-        let fields = self.views.values().flat_map(|view| &view.fields);
-        fields.filter_map(|field| field.tracks.as_ref()).map(|blob| blob.size).sum()
     }
 
     /// A view cannot be tracked, and why; without it no frame can be computed.
@@ -210,7 +214,7 @@ mod tests {
         assert_eq!((ledger.at(4), ledger.missing(0), ledger.missing(2)), (None, Some(6), Some(4)));
         ledger.keep(2, &found(4, "b"));
         assert_eq!(ledger.at(4), Some([(0, blob("a")), (2, blob("b"))].into()));
-        assert_eq!((ledger.at(6), ledger.at(5), ledger.counts(), ledger.bytes()), (None, None, (2, 4), 20));
+        assert_eq!((ledger.at(6), ledger.at(5), ledger.counts()), (None, None, (2, 4)));
         ledger.keep(0, &found(6, "c"));
         assert_eq!((ledger.missing(0), ledger.positions()), (None, vec![0, 2]));
     }
@@ -230,6 +234,17 @@ mod tests {
             assert!(ledger.place(position, &found(frame, "a")).is_err(), "{position} {frame}");
         }
         assert!(ledger.place(0, &TrackedField { frame: 6, tracks: None }).is_err());
+    }
+
+    #[test]
+    fn a_field_of_another_job_counts_and_a_different_one_is_left_aside() {
+        let mut ledger = ledger();
+        ledger.adopt(0, 4, blob("theirs"));
+        assert_eq!(
+            (ledger.task(0).unwrap().frames[1].tracks.clone(), ledger.counts()),
+            (Some(blob("theirs")), (1, 4))
+        );
+        assert_eq!(ledger.place(0, &found(4, "own")), Ok(None));
     }
 
     #[test]

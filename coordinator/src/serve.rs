@@ -178,6 +178,9 @@ async fn run(hub: Arc<Hub>, listener: TcpListener, lock: File) -> Result<(), Ser
     };
     shutdown.cancel();
     hub.drivers_ended().await;
+    if let Err(error) = hub.release_own_leases().await {
+        hub.fail(error);
+    }
     // The ticker only waits for the shutdown now; it cannot fail.
     let _ = ticker.await;
     hub.store.close().await;

@@ -1,10 +1,10 @@
 //! One bidirectional stream to the coordinator, and getting it back after it breaks.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use backon::{ExponentialBuilder, Retryable};
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::{StreamExt, wrappers::ReceiverStream};
 use tonic::{
     Code, Status, Streaming,
     transport::{Channel, Endpoint},
@@ -12,8 +12,8 @@ use tonic::{
 use trackersplat_proto::{
     MAX_WORKER_MESSAGE,
     v1::{
-        CoordinatorMessage, Register, Welcome, WorkerMessage, coordinator_message, worker_message,
-        workers_client::WorkersClient,
+        CoordinatorMessage, FieldReport, Register, Welcome, WorkerMessage, coordinator_message,
+        worker_message, workers_client::WorkersClient,
     },
 };
 
@@ -23,12 +23,23 @@ use crate::setup::WorkerError;
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 /// A silent peer is noticed within about twice this.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
-/// Messages that may wait for the network. A worker sends a few per second; a full queue is a dead connection.
+/// Messages that may wait for the network. A worker sends a few per second, fields aside; a full queue is a dead
+/// connection.
 const OUTGOING_QUEUE: usize = 64;
+/// Track fields among them: more wait until there is room, so that they never fill the queue.
+const OUTGOING_FIELDS: usize = 32;
+
+/// A message that waits for the network, and a field's room, which is free once the network has taken it.
+struct Outgoing {
+    message: WorkerMessage,
+    _room: Option<OwnedSemaphorePermit>,
+}
 
 /// An open stream after a successful registration.
 pub(crate) struct Connection {
-    outgoing: mpsc::Sender<WorkerMessage>,
+    outgoing: mpsc::Sender<Outgoing>,
+    /// Fields that may be queued now.
+    pub(crate) field_room: Arc<Semaphore>,
     incoming: Streaming<CoordinatorMessage>,
     /// The coordinator's terms.
     pub(crate) welcome: Welcome,
@@ -70,8 +81,26 @@ impl Connection {
 
     /// Queues a message; never waits.
     pub(crate) fn send(&self, message: worker_message::Message) -> Result<(), ConnectionError> {
+        self.queue(message, None)
+    }
+
+    /// Queues a field, with its permit of [`Connection::field_room`].
+    pub(crate) fn send_field(
+        &self,
+        field: FieldReport,
+        room: OwnedSemaphorePermit,
+    ) -> Result<(), ConnectionError> {
+        self.queue(worker_message::Message::Field(field), Some(room))
+    }
+
+    fn queue(
+        &self,
+        message: worker_message::Message,
+        room: Option<OwnedSemaphorePermit>,
+    ) -> Result<(), ConnectionError> {
+        let message = WorkerMessage { message: Some(message) };
         self.outgoing
-            .try_send(WorkerMessage { message: Some(message) })
+            .try_send(Outgoing { message, _room: room })
             .map_err(|_| ConnectionError::Lost("the coordinator takes no more messages".into()))
     }
 
@@ -137,11 +166,16 @@ async fn handshake(channel: &Channel, register: &Register) -> Result<Connection,
     let (outgoing, queue) = mpsc::channel(OUTGOING_QUEUE);
     let first = WorkerMessage { message: Some(worker_message::Message::Register(register.clone())) };
     // Queued before the call: the coordinator may answer the call only once it has read the registration.
+    let first = Outgoing { message: first, _room: None };
     outgoing.try_send(first).map_err(|error| ConnectionError::Lost(error.to_string()))?;
     let mut client = WorkersClient::new(channel.clone()).max_decoding_message_size(MAX_WORKER_MESSAGE);
-    let mut incoming = client.work(ReceiverStream::new(queue)).await?.into_inner();
+    let mut incoming =
+        client.work(ReceiverStream::new(queue).map(|queued| queued.message)).await?.into_inner();
     match next_message(&mut incoming).await? {
-        coordinator_message::Message::Welcome(welcome) => Ok(Connection { outgoing, incoming, welcome }),
+        coordinator_message::Message::Welcome(welcome) => {
+            let field_room = Arc::new(Semaphore::new(OUTGOING_FIELDS));
+            Ok(Connection { outgoing, field_room, incoming, welcome })
+        }
         other => {
             Err(ConnectionError::Refused(format!("the coordinator greets with {other:?}, not with Welcome")))
         }

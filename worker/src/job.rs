@@ -23,7 +23,7 @@ use crate::{
     blobs::Blobs,
     connection::backoff,
     inputs::{self, InputCache},
-    tracks::Said,
+    tracks::{LastTracker, Said},
 };
 
 /// What turns a frame's input into its result; `splat::frame::reconstruct_frame` on the worker's engine.
@@ -57,6 +57,7 @@ pub(crate) struct JobRunner {
     pub(crate) pool: Arc<rayon::ThreadPool>,
     pub(crate) cache: Arc<InputCache>,
     pub(crate) ahead: Ahead,
+    pub(crate) last_tracker: Arc<LastTracker>,
     /// How long a transfer is tried again before the job fails as transient.
     pub(crate) patience: Duration,
     /// Seed of the jitter between those tries.

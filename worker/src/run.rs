@@ -9,7 +9,7 @@ use std::{
 
 use splat::{engine::Engine, frame::FrameProgress};
 use tokio::{
-    sync::{mpsc, watch},
+    sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch},
     task::JoinHandle,
     time::{Instant, MissedTickBehavior, interval, interval_at},
 };
@@ -44,7 +44,7 @@ const RECONNECT_PAUSE: Duration = Duration::from_millis(100);
 /// Why a stream is not served any longer, if the worker's work is not over.
 enum StreamEnd {
     Connection(ConnectionError),
-    /// The device is lost for good; the coordinator has the frame back.
+    /// The device is lost for good; the coordinator has the task back.
     Device(String),
 }
 
@@ -56,16 +56,16 @@ impl From<ConnectionError> for StreamEnd {
 
 /// Works for a coordinator until it is dismissed, shut down, or given up on.
 ///
-/// A broken stream is opened again for up to [`WorkerOptions::reconnect_for`]; the running frame goes on meanwhile.
+/// A broken stream is opened again for up to [`WorkerOptions::reconnect_for`]; the running task goes on meanwhile.
 /// The new stream names the lease that the worker still works on, or whose report has no receipt yet, and the lease goes
 /// on over it if the worker is back in time. Whether its result counts is the coordinator's to say: a lease that has
 /// expired, or of before the coordinator was restarted, is cancelled at the next heartbeat, or its report is answered
 /// with a receipt that is not accepted. A report that was accepted before, and comes again because its receipt was lost,
 /// is accepted again; one that is being verified gets no receipt yet, so it is sent until it gets one. Then the worker
-/// asks for the next frame. Needs a tokio runtime with timers and I/O.
+/// asks for the next task. Needs a tokio runtime with timers and I/O.
 ///
-/// After a failed frame the worker asks for the next one only if the engine's device is there, or came back
-/// ([`Engine::check`]); else it ends with [`WorkerError::Device`], so that it does not fail one frame after the other.
+/// After a failed task the worker asks for the next one only if the engine's device is there, or came back
+/// ([`Engine::check`]); else it ends with [`WorkerError::Device`], so that it does not fail one task after the other.
 pub async fn run(
     options: WorkerOptions,
     engine: Arc<dyn Engine>,
@@ -130,7 +130,7 @@ struct Worker {
     engine: Arc<dyn Engine>,
     runner: Arc<JobRunner>,
     shutdown: CancellationToken,
-    /// Whether a frame failed since the device was last looked at.
+    /// Whether a task failed since the device was last looked at.
     is_device_in_doubt: bool,
     running: Option<RunningLease>,
     /// The last result, until the coordinator says it has it.
@@ -169,6 +169,7 @@ impl Worker {
             pool: Arc::new(pool),
             cache: Arc::default(),
             ahead: Ahead::default(),
+            last_tracker: Arc::default(),
             patience: options.reconnect_for,
             jitter_seed,
         });
@@ -224,6 +225,7 @@ impl Worker {
         let resend_period = period * HEARTBEATS_PER_RESEND;
         let mut resend = interval_at(Instant::now() + resend_period, resend_period);
         let shutdown = self.shutdown.clone();
+        let field_room = connection.field_room.clone();
 
         if self.unacknowledged.is_some() {
             self.send_report(&connection)?;
@@ -261,8 +263,8 @@ impl Worker {
                     }
                     coordinator_message::Message::Welcome(_) => tracing::warn!("a second welcome, ignored"),
                 },
-                step = next_step(&mut self.running) => match step {
-                    Step::Field(field) => connection.send(worker_message::Message::Field(field))?,
+                step = next_step(&mut self.running, &field_room) => match step {
+                    Step::Field(field, room) => connection.send_field(field, room)?,
                     Step::Ended(outcome) => {
                         self.unacknowledged = self.report_of(outcome);
                         match self.unacknowledged {
@@ -322,7 +324,7 @@ impl Worker {
         running.cancel.cancel();
     }
 
-    /// Whether the device is there for another frame; it may be opened again for that, which takes a while.
+    /// Whether the device is there for another task; it may be opened again for that, which takes a while.
     async fn look_at_device(&mut self) -> Result<(), String> {
         if !self.is_device_in_doubt {
             return Ok(());
@@ -415,28 +417,37 @@ impl Worker {
 
 /// What becomes of the running lease.
 enum Step {
-    /// A track field is stored.
-    Field(FieldReport),
+    /// A track field is stored, and there is room for it in the queue to the coordinator.
+    Field(FieldReport, OwnedSemaphorePermit),
     /// The task has ended; without an outcome it was cancelled.
     Ended(Option<Outcome>),
 }
 
 /// The next step of the running lease; never ready without one. Fields that are not yet said when the task ends are in
 /// its outcome.
-async fn next_step(running: &mut Option<RunningLease>) -> Step {
+async fn next_step(running: &mut Option<RunningLease>, field_room: &Arc<Semaphore>) -> Step {
     let Some(running) = running else { return pending().await };
     let ended = tokio::select! {
         biased;
         ended = &mut running.task => ended,
-        Some(field) = running.fields.recv() => {
+        Some((field, room)) = next_field(&mut running.fields, field_room) => {
             let (lease_id, attempt) = (running.lease_id.clone(), running.attempt);
-            return Step::Field(FieldReport { lease_id, attempt, field: Some(field) });
+            return Step::Field(FieldReport { lease_id, attempt, field: Some(field) }, room);
         }
     };
     Step::Ended(ended.unwrap_or_else(|error| {
         let message = format!("the worker's task: {error}");
         Some(Outcome::Failure(Failure { kind: FailureKind::Bug.into(), message }))
     }))
+}
+
+/// The next field once there is room for it; until then it waits where it is, also for another stream.
+async fn next_field(
+    fields: &mut mpsc::UnboundedReceiver<TrackedField>,
+    room: &Arc<Semaphore>,
+) -> Option<(TrackedField, OwnedSemaphorePermit)> {
+    let room = room.clone().acquire_owned().await.ok()?;
+    Some((fields.recv().await?, room))
 }
 
 fn heartbeat_period(milliseconds: u32) -> Duration {

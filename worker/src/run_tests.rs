@@ -99,6 +99,22 @@ async fn dismiss(session: &Session) {
 }
 
 #[tokio::test]
+async fn fields_wait_for_room_and_none_is_lost() {
+    use futures::FutureExt;
+    let room = Arc::new(Semaphore::new(1));
+    let (sender, mut fields) = mpsc::unbounded_channel();
+    for frame in [2, 3] {
+        sender.send(TrackedField { frame, tracks: None }).unwrap();
+    }
+    let (first, taken) = next_field(&mut fields, &room).await.unwrap();
+    assert_eq!(first.frame, 2);
+    assert!(next_field(&mut fields, &room).now_or_never().is_none(), "no room");
+    drop(taken);
+    let (second, _taken) = next_field(&mut fields, &room).now_or_never().unwrap().unwrap();
+    assert_eq!(second.frame, 3, "a field that waits stays in line");
+}
+
+#[tokio::test]
 async fn a_lease_becomes_a_stored_delta_and_a_report() {
     let coordinator = TestCoordinator::start().await;
     let (worker, _shutdown) = start(&coordinator, shift());

@@ -211,6 +211,19 @@ async fn a_network_that_comes_with_the_job_tracks() {
     }
 }
 
+#[test]
+fn a_tracker_is_used_again_for_the_same_model_and_settings_only() {
+    let last = LastTracker::default();
+    let wanted = |settings_json: &str| Tracker { settings_json: settings_json.into(), ..Tracker::default() };
+    assert!(last.of(&wanted("{}")).is_none());
+    let loaded = Arc::new(splat::tracking::Tracker::BuiltIn);
+    last.replace(wanted("{}"), loaded.clone());
+    assert!(Arc::ptr_eq(&last.of(&wanted("{}")).unwrap(), &loaded));
+    assert!(last.of(&wanted(r#"{"a": 1}"#)).is_none());
+    let model = Some(Blob { digest: "another network".into(), size: 1 });
+    assert!(last.of(&Tracker { model, ..wanted("{}") }).is_none());
+}
+
 #[tokio::test]
 async fn a_cancelled_view_is_dropped_without_a_report() {
     let coordinator = TestCoordinator::start().await;

@@ -1,6 +1,6 @@
 //! The tracks of a view from the wire to a report: every field is stored and said as soon as it is there.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use backon::Retryable;
 use bytes::Bytes;
@@ -18,7 +18,7 @@ use tokio::{
     sync::{mpsc::UnboundedSender, watch},
 };
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{Failure, FailureKind, TrackFrame, TrackJob, Tracked, TrackedField};
+use trackersplat_proto::v1::{self, Failure, FailureKind, TrackFrame, TrackJob, Tracked, TrackedField};
 
 use crate::{
     blobs::{BlobError, Blobs},
@@ -32,6 +32,21 @@ pub(crate) struct Said {
     pub(crate) progress: watch::Sender<FrameProgress>,
     /// Fields that are stored; at most one per frame of the job.
     pub(crate) fields: UnboundedSender<TrackedField>,
+}
+
+/// The tracker of the last view. The next view is mostly of the same job, and to load a network takes long.
+#[derive(Default)]
+pub(crate) struct LastTracker(Mutex<Option<(v1::Tracker, Arc<Tracker>)>>);
+
+impl LastTracker {
+    fn of(&self, wanted: &v1::Tracker) -> Option<Arc<Tracker>> {
+        let last = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        last.as_ref().filter(|(of, _)| of == wanted).map(|(_, tracker)| tracker.clone())
+    }
+
+    fn replace(&self, of: v1::Tracker, tracker: Arc<Tracker>) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((of, tracker));
+    }
 }
 
 /// Why tracking ended early.
@@ -70,6 +85,7 @@ impl JobRunner {
         };
         let tracking = Tracking {
             settings,
+            last: self.last_tracker.clone(),
             job,
             blobs,
             backoff: backoff(self.patience, self.jitter_seed),
@@ -96,6 +112,7 @@ fn failed(error: JobError) -> Option<Outcome> {
 /// One view that is tracked. Runs on threads of the worker's pool, where waiting is allowed.
 struct Tracking {
     settings: TrackingSettings,
+    last: Arc<LastTracker>,
     job: TrackJob,
     blobs: Blobs,
     backoff: backon::ExponentialBuilder,
@@ -128,8 +145,11 @@ impl Tracking {
         Ok(tracked)
     }
 
-    fn tracker(&self) -> Result<Tracker, Stop> {
+    fn tracker(&self) -> Result<Arc<Tracker>, Stop> {
         let wanted = self.job.tracker.clone().unwrap_or_default();
+        if let Some(tracker) = self.last.of(&wanted) {
+            return Ok(tracker);
+        }
         let bytes = match &wanted.model {
             Some(blob) if blob.size > MAX_MODEL_BYTES as u64 => {
                 let (name, size) = (&wanted.model_name, blob.size);
@@ -140,7 +160,9 @@ impl Tracking {
             None => None,
         };
         let model = bytes.map(|bytes| (bytes, wanted.model_name.as_str()));
-        Ok(Tracker::new(model, &self.settings)?)
+        let tracker = Arc::new(Tracker::new(model, &self.settings)?);
+        self.last.replace(wanted.clone(), tracker.clone());
+        Ok(tracker)
     }
 
     fn advance(&self, index: usize, last: usize) -> Result<(), Stop> {

@@ -54,17 +54,9 @@ impl Bars {
         advance(bar, " ", progress.done, progress.total);
         bar.set_message(format!("{} on {}", progress.stage, progress.worker_id));
     }
-}
 
-impl Bars {
     /// A frame or a view has changed its state: nobody is at it any more, unless it was leased.
-    fn task(
-        &mut self,
-        task: &str,
-        state: TaskState,
-        failure: Option<&Failure>,
-        (attempt, worker): (u32, &str),
-    ) {
+    fn task(&mut self, task: &str, state: TaskState, failure: Option<&Failure>, attempt: u32, worker: &str) {
         if state != TaskState::Leased
             && let Some(bar) = self.running.remove(task)
         {
@@ -99,12 +91,7 @@ impl Display for Bars {
             }
             Some(Event::FrameState(change)) => {
                 let task = frame_label(change.frame);
-                self.task(
-                    &task,
-                    change.state(),
-                    change.failure.as_ref(),
-                    (change.attempt, &change.worker_id),
-                );
+                self.task(&task, change.state(), change.failure.as_ref(), change.attempt, &change.worker_id);
                 let done = outcome.frames_in(TaskState::Done).len();
                 self.frames.set_style(style("  {prefix:<14} {bar:30} {pos}/{len}"));
                 self.frames.set_length(outcome.frames.len() as u64);
@@ -112,12 +99,7 @@ impl Display for Bars {
             }
             Some(Event::TracksState(change)) => {
                 let task = view_label(&change.view);
-                self.task(
-                    &task,
-                    change.state(),
-                    change.failure.as_ref(),
-                    (change.attempt, &change.worker_id),
-                );
+                self.task(&task, change.state(), change.failure.as_ref(), change.attempt, &change.worker_id);
             }
             Some(Event::Progress(progress)) => self.progress(progress),
             Some(Event::Workers(workers)) => {

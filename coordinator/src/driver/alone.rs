@@ -10,9 +10,9 @@ use splat::{
     settings::Settings,
     tracking::{TrackField, Tracker},
 };
-use tokio::runtime::Handle;
+use tokio::{runtime::Handle, sync::OnceCell};
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{TrackJob, TrackedField};
+use trackersplat_proto::v1::{self, TrackJob, TrackedField};
 
 use super::Job;
 use crate::{compute::go_on, failure::StageError, hub::Hub, queue::Lease};
@@ -39,35 +39,66 @@ impl Job {
     /// Tracks as many views at a time as the compute pool has threads. Views that are begun are finished, though workers
     /// may come meanwhile: those take the others.
     async fn track_while_alone(&self) -> Result<(), StageError> {
+        // One for all views: a network may be large.
+        let tracker = OnceCell::new();
         let mut running = FuturesUnordered::new();
+        let mut changed = self.changed.clone();
         loop {
+            changed.borrow_and_update();
             while running.len() < self.hub.options.compute_threads
                 && let Some((lease, request)) = self.hub.lease_own(&self.id, &self.stop).await?
             {
-                running.push(self.track_view(lease, request));
+                running.push(self.track_view(lease, request, &tracker));
             }
-            match running.next().await {
-                Some(ended) => ended?,
-                None => return Ok(()),
+            if running.is_empty() {
+                return Ok(());
+            }
+            tokio::select! {
+                Some(ended) = running.next() => ended?,
+                // More views may be there for the threads that have none.
+                woken = changed.changed() => woken.map_err(|_| StageError::Stopped)?,
             }
         }
     }
 
-    async fn track_view(&self, lease: Lease, request: TrackJob) -> Result<(), StageError> {
-        let work = OwnTracking {
-            hub: self.hub.clone(),
-            lease: lease.clone(),
-            request,
-            settings: self.settings.clone(),
-            stop: self.stop.clone(),
-            runtime: Handle::current(),
+    async fn track_view(
+        &self,
+        lease: Lease,
+        request: TrackJob,
+        tracker: &OnceCell<Arc<Tracker>>,
+    ) -> Result<(), StageError> {
+        let tracked = async {
+            let wanted = request.tracker.clone().unwrap_or_default();
+            let work = OwnTracking {
+                hub: self.hub.clone(),
+                lease: lease.clone(),
+                request,
+                tracker: tracker.get_or_try_init(|| self.tracker(wanted)).await?.clone(),
+                settings: self.settings.clone(),
+                stop: self.stop.clone(),
+                runtime: Handle::current(),
+            };
+            self.hub.compute.run(move || work.run()).await
         };
-        let ended = match self.hub.compute.run(move || work.run()).await {
+        let ended = match tracked.await {
             Ok(()) => Ok(()),
             Err(StageError::Failed(reason)) => Err(reason),
             Err(error) => return Err(error),
         };
         self.hub.own_ended(&lease, ended).await
+    }
+
+    async fn tracker(&self, wanted: v1::Tracker) -> Result<Arc<Tracker>, StageError> {
+        let bytes = match &wanted.model {
+            Some(blob) => Some(self.hub.blobs.get(blob).await?.to_vec()),
+            None => None,
+        };
+        let settings = self.settings.clone();
+        let load = move || -> Result<_, StageError> {
+            let model = bytes.map(|bytes| (bytes, wanted.model_name.as_str()));
+            Ok(Arc::new(Tracker::new(model, &settings.tracking)?))
+        };
+        self.hub.compute.run(load).await
     }
 }
 
@@ -76,6 +107,7 @@ struct OwnTracking {
     hub: Arc<Hub>,
     lease: Lease,
     request: TrackJob,
+    tracker: Arc<Tracker>,
     settings: Arc<Settings>,
     stop: CancellationToken,
     runtime: Handle,
@@ -87,17 +119,7 @@ impl OwnTracking {
         let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
         let mut load = |index: usize| self.load(index);
         let mut emit = |index: usize, field: TrackField| self.emit(index, &field);
-        self.tracker()?.track_view(last + 1, &mut load, &self.settings.tracking, &mut emit)
-    }
-
-    fn tracker(&self) -> Result<Tracker, StageError> {
-        let wanted = self.request.tracker.clone().unwrap_or_default();
-        let bytes = match &wanted.model {
-            Some(blob) => Some(self.runtime.block_on(self.hub.blobs.get(blob))?.to_vec()),
-            None => None,
-        };
-        let model = bytes.map(|bytes| (bytes, wanted.model_name.as_str()));
-        Ok(Tracker::new(model, &self.settings.tracking)?)
+        self.tracker.track_view(last + 1, &mut load, &self.settings.tracking, &mut emit)
     }
 
     fn load(&self, index: usize) -> Result<Arc<Image>, StageError> {

@@ -74,7 +74,7 @@ impl Job {
     async fn parts(&self, records: &[FrameRecord]) -> Result<Parts, StageError> {
         let base = self.load_base().await?;
         let views = self.views().await?;
-        let (mut image_bytes, mut delta_bytes) = (0, 0);
+        let (mut image_bytes, mut track_bytes, mut delta_bytes) = (0, 0, 0);
         let mut test_images = BTreeMap::new();
         for &frame in &self.frames {
             for record in self.hub.store.images(&self.id, frame).await? {
@@ -84,9 +84,11 @@ impl Job {
                 }
             }
         }
-        let track_bytes = if self.is_tracked() { self.ledger().await?.bytes() } else { 0 };
         let mut frames = Vec::new();
         for record in records {
+            let training = record.request()?.training_views;
+            track_bytes +=
+                training.into_iter().filter_map(|view| view.tracks).map(|tracks| tracks.size).sum::<u64>();
             let frame = self.assembled(record, &base).await?;
             delta_bytes += frame.delta.as_ref().map_or(0, |delta| delta.len() as u64);
             frames.push(frame);

@@ -8,15 +8,16 @@ use std::{
 use splat::clip::Clip;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{CancelLease, Dismiss, Failure, coordinator_message::Message};
+use trackersplat_proto::v1::{CancelLease, Dismiss, Failure, FailureKind, coordinator_message::Message};
 
 use super::{ActiveJob, Desk, FrameBase, Hub};
 use crate::{
     driver,
-    failure::StageError,
+    failure::{StageError, failure},
     queue::{
-        JobId,
+        JobId, OWN_NAME,
         job::{JobState, JobTrigger},
+        retry::{Decision, decide},
         task::TaskState,
     },
     store::{AttemptOutcome, Change, NewJob, OrphanedLease, StoreError, TaskEvent},
@@ -27,11 +28,12 @@ impl Hub {
     pub(crate) async fn recover(self: &Arc<Self>) -> Result<(), StoreError> {
         let mut change = self.store.change().await?;
         change.all_workers_gone().await?;
-        for OrphanedLease { id, key, attempt, worker } in change.orphaned_leases().await? {
-            change.end_attempt(&id, AttemptOutcome::Released("the coordinator was restarted")).await?;
-            change.release_task(&key, attempt, &worker).await?;
-            let (kind, number) = (key.task.kind(), key.task.number());
-            tracing::info!(job_id = %key.job, kind, number, attempt, "lease of the former coordinator is void");
+        for lease in change.orphaned_leases().await? {
+            if lease.worker == OWN_NAME {
+                self.count_own_loss(&mut change, &lease).await?;
+            } else {
+                release(&mut change, &lease, "the coordinator was restarted").await?;
+            }
         }
         change.commit().await?;
         for job in self.store.jobs().await? {
@@ -40,6 +42,34 @@ impl Hub {
                 self.activate(&job.id, None).await;
             }
         }
+        Ok(())
+    }
+
+    /// Own leases of an orderly end are given back: nobody was lost with them.
+    pub(crate) async fn release_own_leases(&self) -> Result<(), StoreError> {
+        let mut change = self.store.change().await?;
+        for lease in change.orphaned_leases().await?.iter().filter(|lease| lease.worker == OWN_NAME) {
+            release(&mut change, lease, "the coordinator was stopped").await?;
+        }
+        change.commit().await
+    }
+
+    /// The coordinator died over its own work: that counts, so that a view that kills it is not begun for ever.
+    async fn count_own_loss(&self, change: &mut Change, lease: &OrphanedLease) -> Result<(), StoreError> {
+        let OrphanedLease { id, key, attempt, worker } = lease;
+        let failures = self.store.task(key).await?.map_or(0, |task| task.failures) + 1;
+        let reason = failure(FailureKind::LostWorker, "the coordinator died while it tracked the view");
+        let next = match decide(reason.kind(), failures, self.options.max_attempts) {
+            Decision::Retry(_) => TaskState::Ready,
+            Decision::GiveUp => TaskState::Failed,
+        };
+        change.end_attempt(id, AttemptOutcome::Failed(reason.kind(), &reason.message)).await?;
+        change.count_failure(&key.job, key.task, None).await?;
+        change.set_task_state(&key.job, key.task, next).await?;
+        let event =
+            TaskEvent { attempt: *attempt, worker, failure: Some(&reason), ..TaskEvent::of(key.task) };
+        change.append_task_event(&key.job, next, &event).await?;
+        tracing::warn!(job_id = %key.job, number = key.task.number(), attempt, failures, "{}", reason.message);
         Ok(())
     }
 
@@ -245,6 +275,15 @@ impl Hub {
             desk.send(session, Message::Dismiss(Dismiss { reason: "no job is left".into() }));
         }
     }
+}
+
+async fn release(change: &mut Change, lease: &OrphanedLease, reason: &str) -> Result<(), StoreError> {
+    let OrphanedLease { id, key, attempt, worker } = lease;
+    change.end_attempt(id, AttemptOutcome::Released(reason)).await?;
+    change.release_task(key, *attempt, worker).await?;
+    let (kind, number) = (key.task.kind(), key.task.number());
+    tracing::info!(job_id = %key.job, kind, number, attempt, reason, "the lease is void");
+    Ok(())
 }
 
 async fn cancel_open_tasks(change: &mut Change, job: &JobId) -> Result<(), StoreError> {

@@ -14,6 +14,7 @@ use std::{
     collections::{BTreeMap, HashMap},
     path::PathBuf,
     sync::{Arc, Mutex, PoisonError},
+    time::Instant,
 };
 
 use splat::{clip::Clip, engine::Engine, gaussians::Gaussians};
@@ -67,7 +68,7 @@ pub(crate) struct ActiveJob {
     pub(crate) clip: Option<Arc<Clip>>,
     base: Option<Arc<FrameBase>>,
     tracks: Option<TrackLedger>,
-    /// Connected workers and waiting frames as clients were last told.
+    /// Connected workers and waiting tasks as clients were last told.
     told: Option<(usize, usize)>,
 }
 
@@ -118,7 +119,7 @@ impl Hub {
             reconnect_grace: options.reconnect_grace,
         };
         let desk = Desk {
-            queue: Queue::new(policy),
+            queue: Queue::new(policy, Instant::now()),
             sessions: BTreeMap::new(),
             active: HashMap::new(),
             next_session: 1,
@@ -236,24 +237,24 @@ impl Hub {
         self.tell(Notice::Stored(job.clone()));
     }
 
-    /// How many workers there are and how many of the job's frames wait for one; `None` unless the job is active.
+    /// How many workers there are and how many of the job's tasks wait for one; `None` unless the job is active.
     pub(crate) async fn workers_now(&self, job: &str, sequence: u64) -> Option<JobEvent> {
         let desk = self.desk.lock().await;
         desk.active.contains_key(job).then(|| JobEvent {
             sequence,
             job_id: job.to_owned(),
-            event: Some(workers_event(desk.queue.connected(), desk.queue.waiting_frames(job))),
+            event: Some(workers_event(desk.queue.connected(), desk.queue.waiting_tasks(job))),
         })
     }
 
-    /// Tells watching clients of every active job if workers or waiting frames have changed.
+    /// Tells watching clients of every active job if workers or waiting tasks have changed.
     fn tell_workers(&self, desk: &mut Desk) {
         let connected = desk.queue.connected();
         for (id, job) in &mut desk.active {
-            let now = (connected, desk.queue.waiting_frames(id));
+            let now = (connected, desk.queue.waiting_tasks(id));
             if job.told.replace(now) != Some(now) {
                 if now.1 > 0 {
-                    tracing::info!(job_id = %id, connected, waiting_frames = now.1, "frames wait for a worker");
+                    tracing::info!(job_id = %id, connected, waiting = now.1, "tasks wait for a worker");
                 }
                 self.tell(Notice::Transient(id.clone(), workers_event(now.0, now.1)));
                 job.changed.send_replace(());

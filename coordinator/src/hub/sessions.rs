@@ -91,7 +91,7 @@ impl Hub {
     /// A worker drains: its lease goes back without counting as failed.
     pub(crate) async fn going_away(&self, session: SessionId, reason: &str) -> Result<(), StoreError> {
         let mut desk = self.desk.lock().await;
-        let given_back = desk.queue.drain(session);
+        let given_back = desk.queue.drain(session, Instant::now());
         let worker_id = self.forget(&mut desk, session).await?;
         tracing::info!(worker_id, reason, "worker drains");
         if let Some(lease) = given_back {
@@ -170,7 +170,12 @@ impl Hub {
         if self.options.dismiss_workers_when_idle {
             self.give_up_beyond_all_workers(&mut desk).await?;
         }
-        self.dispatch(&mut desk).await
+        self.dispatch(&mut desk).await?;
+        // That no worker has come for long enough is no event of its own.
+        for job in desk.active.keys().filter(|job| desk.queue.has_own_work(job, now)) {
+            desk.changed(job);
+        }
+        Ok(())
     }
 
     /// Gives ready tasks to waiting workers: granted on disk before the worker hears of it.

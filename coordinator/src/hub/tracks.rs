@@ -122,7 +122,7 @@ impl Hub {
 
     /// Whether a view of the job is to be tracked by the coordinator itself: no connected worker may.
     pub(crate) async fn has_own_work(&self, job: &JobId) -> bool {
-        self.desk.lock().await.queue.has_own_work(job)
+        self.desk.lock().await.queue.has_own_work(job, Instant::now())
     }
 
     /// The coordinator's own lease of such a view.
@@ -134,6 +134,10 @@ impl Hub {
         let mut desk = self.desk.lock().await;
         if stop.is_cancelled() {
             return Err(StageError::Stopped);
+        }
+        // Views are published with the ledger; without it there is none to lease.
+        if desk.ledger(job).is_none() {
+            return Ok(None);
         }
         let id = uuid::Uuid::now_v7().simple().to_string();
         let Some(lease) = desk.queue.lease_own(job, Instant::now(), id) else { return Ok(None) };
@@ -269,16 +273,31 @@ impl Hub {
             (Ok(()), Err(reason)) => return Ok(Err(reason)),
             (Ok(()), Ok(None)) | (Err(_), _) => return Ok(Ok(())),
         }
+        let known = self.held_field(&place.key).await?;
         let mut change = self.store.change().await?;
-        change.put_artifact(&place.key, "tracks", &Artifact { blob, note: String::new() }).await?;
+        if known.is_none() {
+            let artifact = Artifact { blob: blob.clone(), note: String::new() };
+            change.put_artifact(&place.key, "tracks", &artifact).await?;
+        }
+        change.forget_failures(&lease.key).await?;
         change.commit().await?;
+        desk.queue.progressed(&lease.key);
         if let Some(ledger) = desk.ledger_mut(job) {
-            ledger.keep(position, field);
+            match known.filter(|known| *known != blob) {
+                Some(known) => ledger.adopt(position, field.frame, known),
+                None => ledger.keep(position, field),
+            }
             let (done, total) = ledger.counts();
             self.progress(job, "tracking", done, total);
         }
         desk.changed(job);
         Ok(Ok(()))
+    }
+
+    /// The field of this key that another job of the same clip has made meanwhile.
+    async fn held_field(&self, key: &str) -> Result<Option<Blob>, StoreError> {
+        let Some(Artifact { blob, .. }) = self.store.artifact(key).await? else { return Ok(None) };
+        Ok(self.blobs.holds(&blob).await.then_some(blob))
     }
 
     /// The field is what its name says, readable, and of the size of the view.

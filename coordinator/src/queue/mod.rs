@@ -93,17 +93,20 @@ pub struct Queue {
     leases: BTreeMap<String, Lease>,
     sessions: BTreeMap<SessionId, Session>,
     next_ticket: u64,
+    /// Since when no worker is connected, if none is.
+    alone_since: Instant,
 }
 
 impl Queue {
     /// An empty queue.
-    pub fn new(policy: QueuePolicy) -> Self {
+    pub fn new(policy: QueuePolicy, now: Instant) -> Self {
         Self {
             policy,
             tasks: BTreeMap::new(),
             leases: BTreeMap::new(),
             sessions: BTreeMap::new(),
             next_ticket: 0,
+            alone_since: now,
         }
     }
 
@@ -142,7 +145,7 @@ impl Queue {
 
     /// A worker's stream is gone: the lease waits a little for its holder to come back.
     pub fn disconnect(&mut self, session: SessionId, now: Instant) {
-        let Some(lease_id) = self.sessions.remove(&session).and_then(|session| session.lease) else { return };
+        let Some(lease_id) = self.leave(session, now).and_then(|session| session.lease) else { return };
         if let Some(lease) = self.leases.get_mut(&lease_id) {
             lease.deadline = lease.deadline.min(now + self.policy.reconnect_grace);
         }
@@ -150,14 +153,22 @@ impl Queue {
 
     /// A worker drains: it gets nothing more, and its lease is void without counting as a failed attempt. A lease whose
     /// result is being verified goes on to its end.
-    pub fn drain(&mut self, session: SessionId) -> Option<Lease> {
-        let lease_id = self.sessions.remove(&session)?.lease?;
+    pub fn drain(&mut self, session: SessionId, now: Instant) -> Option<Lease> {
+        let lease_id = self.leave(session, now)?.lease?;
         if self.leases.get(&lease_id)?.reporting.is_some() {
             return None;
         }
         let lease = self.end(&lease_id)?;
         self.reopen(&lease.key);
         Some(lease)
+    }
+
+    fn leave(&mut self, session: SessionId, now: Instant) -> Option<Session> {
+        let left = self.sessions.remove(&session)?;
+        if self.sessions.is_empty() {
+            self.alone_since = now;
+        }
+        Some(left)
     }
 
     /// A worker asks for one task. It waits until one is there and it holds no lease.
@@ -203,20 +214,25 @@ impl Queue {
         Some(lease)
     }
 
-    /// Whether the coordinator is to track a view of a job itself: no connected worker may.
-    pub fn has_own_work(&self, job: &str) -> bool {
-        self.own_work(job).is_some()
+    /// Whether the coordinator is to track a view of a job itself: no connected worker may, and where none is connected
+    /// none has come for [`QueuePolicy::reconnect_grace`]. After a restart the views are thus left to the workers that
+    /// come back.
+    pub fn has_own_work(&self, job: &str, now: Instant) -> bool {
+        self.own_work(job, now).is_some()
     }
 
     /// The coordinator's own lease of such a view.
     pub fn lease_own(&mut self, job: &str, now: Instant, lease_id: String) -> Option<Lease> {
-        let key = self.own_work(job)?.clone();
+        let key = self.own_work(job, now)?.clone();
         let holder =
             Holder { worker_id: OWN_NAME.to_owned(), incarnation: String::new(), session: SessionId::OWN };
         self.give(key, holder, now, lease_id)
     }
 
-    fn own_work(&self, job: &str) -> Option<&TaskKey> {
+    fn own_work(&self, job: &str, now: Instant) -> Option<&TaskKey> {
+        if self.sessions.is_empty() && now < self.alone_since + self.policy.reconnect_grace {
+            return None;
+        }
         let is_left = |(key, task): &(&TaskKey, &OpenTask)| {
             let of_job = &*key.job == job && matches!(key.task, Task::Tracks(_));
             of_job && !self.is_servable(task) && !task.history.excluded.contains(OWN_NAME)
@@ -312,6 +328,13 @@ impl Queue {
         Ok(lease)
     }
 
+    /// A part of the task's result is kept: whatever failed before, the task gets on, and has all its attempts again.
+    pub fn progressed(&mut self, key: &TaskKey) {
+        if let Some(task) = self.tasks.get_mut(key) {
+            task.history.failures = 0;
+        }
+    }
+
     /// The attempt failed.
     pub fn fail(&mut self, lease_id: &str, attempt: u32, kind: FailureKind) -> Result<FailedLease, Stale> {
         self.in_force(lease_id, attempt)?;
@@ -340,9 +363,14 @@ impl Queue {
         is_ready && self.tasks.remove(key).is_some()
     }
 
-    /// Ready frames of a job that no connected worker may take. Tracks never wait: the coordinator does them itself.
-    pub fn waiting_frames(&self, job: &str) -> usize {
-        self.unservable_frames().filter(|key| &*key.job == job).count()
+    /// Ready tasks of a job that nobody may do now: frames that no connected worker may take, and views for which the
+    /// coordinator lacks the resources as well.
+    pub fn waiting_tasks(&self, job: &str) -> usize {
+        let waits = |(key, task): &(&TaskKey, &OpenTask)| {
+            let is_own = matches!(key.task, Task::Tracks(_)) && !task.history.excluded.contains(OWN_NAME);
+            &*key.job == job && !is_own && !self.is_servable(task)
+        };
+        self.ready().filter(waits).count()
     }
 
     /// Ready frames for which every connected worker, and there is at least one, lacks the resources. None while a

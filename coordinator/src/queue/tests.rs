@@ -13,11 +13,12 @@ struct Bench {
 impl Bench {
     fn new(frames: impl IntoIterator<Item = u32>) -> Self {
         let policy = QueuePolicy { max_attempts: 3, lease_duration: LEASE, reconnect_grace: GRACE };
-        let mut queue = Queue::new(policy);
+        let now = Instant::now();
+        let mut queue = Queue::new(policy, now);
         for frame in frames {
             queue.add(key(frame), TaskHistory::default());
         }
-        Self { queue, now: Instant::now(), leases: 0 }
+        Self { queue, now, leases: 0 }
     }
 
     fn connect(&mut self, session: u64, worker: &str) -> SessionId {
@@ -210,7 +211,7 @@ fn out_of_resources_waits_for_another_worker() {
     let lease = bench.assign_one();
     assert!(bench.fail(&lease, FailureKind::OutOfResources).retried);
     assert_eq!(bench.assign(), [], "the same worker does not get it again");
-    assert_eq!(bench.queue.waiting_frames("job"), 1);
+    assert_eq!(bench.queue.waiting_tasks("job"), 1);
     assert_eq!(bench.queue.frames_beyond_all_workers(), [key(1)]);
     bench.connect(2, "large");
     assert_eq!(bench.queue.frames_beyond_all_workers(), []);
@@ -237,7 +238,7 @@ fn a_draining_worker_gives_its_frame_back_without_a_failure() {
     for attempt in 1..=5 {
         let session = bench.connect(attempt.into(), "w");
         assert_eq!(bench.assign_one().attempt, attempt);
-        let given_back = bench.queue.drain(session).expect("a lease");
+        let given_back = bench.queue.drain(session, bench.now).expect("a lease");
         assert_eq!(given_back.attempt, attempt, "attempts count up, so that stale reports are told apart");
     }
     assert_eq!((bench.queue.open_tasks("job"), bench.queue.connected()), (1, 0));
@@ -334,7 +335,7 @@ fn a_worker_that_drains_while_its_result_is_verified_keeps_it() {
     let session = bench.connect(1, "w");
     let lease = bench.assign_one();
     bench.queue.begin_report(session, &lease.id, 1).expect("held");
-    assert_eq!(bench.queue.drain(session), None);
+    assert_eq!(bench.queue.drain(session, bench.now), None);
     bench.connect(2, "v");
     assert_eq!(bench.assign(), [], "the frame is not given out beside its verification");
     assert!(bench.queue.commit(&lease.id, 1).is_ok());
@@ -387,10 +388,10 @@ fn attempts_go_on_from_the_history() {
 #[test]
 fn with_no_worker_every_ready_frame_waits() {
     let mut bench = Bench::new([1, 2, 3]);
-    assert_eq!((bench.queue.connected(), bench.queue.waiting_frames("job")), (0, 3));
+    assert_eq!((bench.queue.connected(), bench.queue.waiting_tasks("job")), (0, 3));
     assert_eq!(bench.queue.frames_beyond_all_workers(), [], "a worker may still join");
     bench.connect(1, "w");
-    assert_eq!(bench.queue.waiting_frames("job"), 0);
+    assert_eq!(bench.queue.waiting_tasks("job"), 0);
     assert!(bench.queue.close_ready(&key(3)) && !bench.queue.close_ready(&key(3)));
 }
 
@@ -423,9 +424,11 @@ fn the_coordinator_tracks_itself_only_what_no_connected_worker_may() {
     bench.queue.add(tracks(0), TaskHistory::default());
     bench.queue.add(tracks(1), TaskHistory::default());
     bench.queue.add(tracks(2), TaskHistory::default());
+    assert_eq!(lease_own(&mut bench), None, "a worker may be about to come");
+    bench.now += GRACE;
     let own = lease_own(&mut bench).expect("nobody is connected");
     assert_eq!((own.key.clone(), own.worker_id.as_str(), own.session), (tracks(0), OWN_NAME, SessionId::OWN));
-    assert!(!bench.queue.has_own_work("another job"));
+    assert!(!bench.queue.has_own_work("another job", bench.now));
 
     let small = bench.connect(1, "small");
     assert_eq!(lease_own(&mut bench), None, "a worker is there");
@@ -434,23 +437,27 @@ fn the_coordinator_tracks_itself_only_what_no_connected_worker_may() {
     bench.fail(&lease, FailureKind::OutOfResources);
     assert_eq!(bench.assign_one().key, tracks(2));
     assert_eq!(lease_own(&mut bench).expect("no worker has the memory").key, tracks(1));
-    assert_eq!(bench.queue.waiting_frames("job"), 0);
+    assert_eq!(bench.queue.waiting_tasks("job"), 0);
     bench.lose(small);
+    assert_eq!(lease_own(&mut bench), None, "it may come back");
+    bench.now += GRACE;
     assert_eq!(lease_own(&mut bench).expect("the worker is gone").key, tracks(2));
     assert_eq!(lease_own(&mut bench), None, "frames are for workers");
-    assert_eq!(bench.queue.waiting_frames("job"), 1);
+    assert_eq!(bench.queue.waiting_tasks("job"), 1);
 }
 
 #[test]
 fn own_leases_need_no_heartbeat_and_count_as_no_worker() {
     let mut bench = Bench::new([]);
     bench.queue.add(tracks(0), TaskHistory::default());
+    bench.now += GRACE;
     let own = lease_own(&mut bench).expect("nobody is connected");
     assert_eq!(bench.queue.expire(bench.now + 100 * LEASE), []);
     assert_eq!((bench.queue.connected(), bench.queue.open_tasks("job")), (0, 1));
     let failed = bench.queue.fail(&own.id, own.attempt, FailureKind::OutOfResources).expect("held");
     assert!(failed.retried);
     assert_eq!(lease_own(&mut bench), None, "it lacks the memory and waits for a worker");
+    assert_eq!(bench.queue.waiting_tasks("job"), 1);
     bench.connect(1, "large");
     let lease = bench.assign_one();
     assert_eq!((lease.worker_id.as_str(), lease.attempt), ("large", 2));
@@ -466,4 +473,20 @@ fn a_hint_is_given_past_tracks_that_are_given_out_before() {
     bench.connect(1, "one");
     let lease = bench.assign_one();
     assert_eq!(bench.queue.likely_next(&lease), Some(&tracks(1)));
+}
+
+#[test]
+fn a_task_that_gets_on_has_all_its_attempts_again() {
+    let mut bench = Bench::new([]);
+    bench.queue.add(tracks(0), TaskHistory::default());
+    bench.connect(1, "w");
+    for _ in 0..4 {
+        let lease = bench.assign_one();
+        bench.queue.progressed(&lease.key);
+        assert!(bench.fail(&lease, FailureKind::Transient).retried);
+    }
+    for retried in [true, false] {
+        let lease = bench.assign_one();
+        assert_eq!(bench.fail(&lease, FailureKind::Transient).retried, retried);
+    }
 }

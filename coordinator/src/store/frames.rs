@@ -199,7 +199,8 @@ impl Change {
     pub async fn publish_frame(&mut self, request: &FrameJob, result_key: &str) -> Result<(), StoreError> {
         let sql = "INSERT INTO tasks (job_id, kind, number, state, request, result_key, changed_at) \
                    VALUES (?, 'frame', ?, 'ready', ?, ?, strftime('%Y-%m-%dT%H:%M:%fZ', 'now')) \
-                   ON CONFLICT (job_id, kind, number) DO UPDATE SET request = excluded.request";
+                   ON CONFLICT (job_id, kind, number) \
+                   DO UPDATE SET request = excluded.request, result_key = excluded.result_key";
         let query = sqlx::query(sql).bind(&request.job_id).bind(request.frame);
         query.bind(request.encode_to_vec()).bind(result_key).execute(&mut *self.transaction).await?;
         Ok(())

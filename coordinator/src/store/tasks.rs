@@ -194,6 +194,15 @@ impl Change {
         Ok(())
     }
 
+    /// A task gets on: it has all its attempts again.
+    pub async fn forget_failures(&mut self, key: &TaskKey) -> Result<(), StoreError> {
+        let sql = "UPDATE tasks SET failures = 0 \
+                   WHERE job_id = ? AND kind = ? AND number = ? AND failures > 0";
+        let query = sqlx::query(sql).bind(&*key.job).bind(key.task.kind()).bind(key.task.number());
+        query.execute(&mut *self.transaction).await?;
+        Ok(())
+    }
+
     /// Gives the failed and cancelled tasks of a job all their attempts again, and says so.
     pub async fn reopen_tasks(&mut self, job: &str) -> Result<(), StoreError> {
         let sql = "SELECT kind, number FROM tasks WHERE job_id = ? AND state IN ('failed', 'cancelled') \

@@ -32,7 +32,7 @@ fn new_job(id: &str) -> NewJob {
 fn lease(job: &str, frame: u32, attempts: u32) -> Lease {
     let lease_duration = Duration::from_secs(1);
     let policy = QueuePolicy { max_attempts: 3, lease_duration, reconnect_grace: Duration::ZERO };
-    let mut queue = Queue::new(policy);
+    let mut queue = Queue::new(policy, Instant::now());
     let history = crate::queue::TaskHistory { attempts, ..Default::default() };
     queue.add(TaskKey { job: job.into(), task: Task::Frame(frame) }, history);
     let worker = Register { worker_id: "w".into(), ..Register::default() };

@@ -4,6 +4,7 @@ mod harness;
 mod jobs;
 mod learned;
 mod leases;
+mod own_tracks;
 mod ownership;
 mod remote_clips;
 mod reports;

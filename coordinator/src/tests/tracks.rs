@@ -1,6 +1,8 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 //! Tracks of views as tasks: given out, reported field by field, resumed.
 
+use std::time::Duration;
+
 use splat::{formats::track_blob, tracking::TrackField};
 use trackersplat_proto::v1::{
     Blob, CancelLease, FailureKind, FieldReport, JobState, Lease, SubmitRequest, TaskState, Tracked,
@@ -41,13 +43,13 @@ async fn cancelled(worker: &mut Worker) -> CancelLease {
 }
 
 /// Says the fields to frames 2 and 3 and that the view is complete.
-async fn track_honestly(bench: &Bench, worker: &mut Worker, lease: &Lease) {
+pub(super) async fn track_honestly(bench: &Bench, worker: &mut Worker, lease: &Lease) {
     let fields = vec![field(bench, 2).await, field(bench, 3).await];
     let receipt = worker.report(lease, Outcome::Tracked(Tracked { fields })).await;
     assert!(receipt.accepted, "{receipt:?}");
 }
 
-fn tracked_request(bench: &Bench) -> SubmitRequest {
+pub(super) fn tracked_request(bench: &Bench) -> SubmitRequest {
     SubmitRequest { settings_json: String::new(), ..bench.request() }
 }
 
@@ -100,7 +102,8 @@ async fn a_frame_is_given_out_once_every_view_is_tracked_to_it() {
 
 #[tokio::test]
 async fn tracks_of_a_lost_worker_go_on_with_the_fields_that_it_had_stored() {
-    let mut bench = Bench::start().await;
+    // Long enough for the heir to come back before the coordinator tracks by itself.
+    let mut bench = Bench::start_with(|options| options.reconnect_grace = Duration::from_secs(3)).await;
     let [lost, mut heir] = workers(&bench).await;
     let mut lost = lost;
     let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
@@ -157,11 +160,14 @@ async fn fields_that_do_not_verify_or_differ_fail_the_attempt() {
     let lease = worker.lease().await;
     assert_eq!(track_job(&lease).frames[1].tracks, fields[0].tracks, "what was verified counts");
     fields[0].tracks = Some(bench.put(encoded(8, 7.0)).await);
-    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields })).await;
+    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields: fields.clone() })).await;
     assert!(!receipt.accepted && receipt.reason.contains("was reported before"), "{receipt:?}");
+    let lease = worker.lease().await;
+    assert_eq!(lease.attempt, 4, "the failure before the field was kept does not count any more");
+    assert!(!worker.report(&lease, Outcome::Tracked(Tracked { fields })).await.accepted);
     let (state, failure) = bench.ended(&job).await;
     let failure = failure.unwrap();
-    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::Bug), "its third attempt");
+    assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::Bug), "the third failure since");
     assert!(failure.message.contains("cam00"), "{}", failure.message);
 }
 
@@ -211,6 +217,42 @@ async fn without_a_worker_the_coordinator_tracks_by_itself_and_another_job_reuse
         assert_eq!(worker.work_once(&bench).await, frame, "frames are for workers");
     }
     assert_eq!(bench.ended(&job).await.0, JobState::Done);
+
+    let again = SubmitRequest { output: bench.path("again"), ..tracked_request(&bench) };
+    let other = bench.submit(again).await.unwrap().job_id;
+    let events = bench.watch(&other, 0).await.rest().await;
+    assert!(!events.iter().any(|event| matches!(event.event, Some(Event::TracksState(_)))));
+    assert_eq!(bench.ended(&other).await.0, JobState::Done, "with the tracks and frames of the first");
+}
+
+#[tokio::test]
+async fn of_two_jobs_that_track_the_same_view_the_first_field_counts_for_both() {
+    let bench = Bench::start().await;
+    let [mut slow, mut b, mut c, mut fast] = workers(&bench).await;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    let lease = slow.lease().await;
+    for worker in [&mut b, &mut c] {
+        worker.lease().await;
+    }
+    assert_eq!(fast.work_once(&bench).await, 1, "no view is left");
+    let again = SubmitRequest { output: bench.path("again"), ..tracked_request(&bench) };
+    let other = bench.submit(again).await.unwrap().job_id;
+    let theirs = fast.lease().await;
+    assert_eq!((track_job(&theirs).job_id, track_job(&theirs).view), (other.clone(), "cam00".into()));
+    let first = field(&bench, 2).await;
+    let mut watch = bench.watch(&other, 0).await;
+    say(&fast, &theirs, first.clone()).await;
+    let kept = |event: &Event| matches!(event, Event::Progress(p) if p.stage == "tracking" && p.done == 1);
+    watch.until(kept).await;
+
+    let different = TrackedField { frame: 2, tracks: Some(bench.put(encoded(8, 9.0)).await) };
+    say(&slow, &lease, different.clone()).await;
+    let fields = vec![different, field(&bench, 3).await];
+    let receipt = slow.report(&lease, Outcome::Tracked(Tracked { fields })).await;
+    assert!(receipt.accepted, "{receipt:?}");
+    let known = bench.hub().tracks(&job.as_str().into(), |ledger| ledger.task(0)).await.unwrap().unwrap();
+    assert_eq!(known.frames[1].tracks, first.tracks);
+    track_honestly(&bench, &mut fast, &theirs).await;
 }
 
 impl Bench {
