@@ -124,7 +124,7 @@ struct Tracking {
 impl Tracking {
     fn run(&self) -> Result<Tracked, Stop> {
         let frames = &self.job.frames;
-        // Tracks are chained through earlier frames: fields that exist before this one are made again, later ones not.
+        // What chains tracks through earlier frames makes the fields before this one again, later ones not.
         let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
         let mut tracked = Tracked::default();
         let mut load = |index: usize| self.load(&frames[index]);
@@ -141,7 +141,8 @@ impl Tracking {
             self.advance(index, last)
         };
         self.advance(0, last)?;
-        self.tracker()?.track_view(last + 1, &mut load, &self.settings, &mut emit)?;
+        let is_missing = |index: usize| frames[index].tracks.is_none();
+        self.tracker()?.track_missing(last + 1, &is_missing, &mut load, &self.settings, &mut emit)?;
         Ok(tracked)
     }
 

@@ -119,7 +119,8 @@ impl OwnTracking {
         let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
         let mut load = |index: usize| self.load(index);
         let mut emit = |index: usize, field: TrackField| self.emit(index, &field);
-        self.tracker.track_view(last + 1, &mut load, &self.settings.tracking, &mut emit)
+        let is_missing = |index: usize| frames[index].tracks.is_none();
+        self.tracker.track_missing(last + 1, &is_missing, &mut load, &self.settings.tracking, &mut emit)
     }
 
     fn load(&self, index: usize) -> Result<Arc<Image>, StageError> {

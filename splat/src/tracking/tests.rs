@@ -165,10 +165,12 @@ fn jumps_larger_than_the_object_are_followed_and_what_they_cover_is_hidden() {
         assert!(fraction(square.iter().map(|&i| field.visible[i])) > 0.9);
         assert!(quantile(square.iter().map(|&i| errors_moved[i]).collect(), 0.9) < 0.3);
 
+        // So do those that the square's edge covers.
         let covered =
-            pixels().filter(|&(_, x, y)| within(x, y, corner, 2.0) && !within(x, y, corners[0], -6.0));
+            pixels().filter(|&(_, x, y)| within(x, y, corner, 3.0) && !within(x, y, corners[0], -6.0));
         let seen = fraction(covered.map(|(i, ..)| field.visible[i]));
-        assert!(seen < 0.03, "{seen}");
+        // What is covered here and what is uncovered there may look alike, and then they match each other both ways.
+        assert!(seen < 0.12, "{seen}");
 
         let wall: Vec<usize> = pixels()
             .filter(|&(_, x, y)| !within(x, y, corner, -8.0) && !within(x, y, corners[0], -8.0))

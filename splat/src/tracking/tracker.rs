@@ -38,6 +38,7 @@ impl Tracker {
             Self::Learned(tracker) => tracker.track_view(frame_count, load, settings, emit),
         }
     }
+
     /// [`Self::track_view`] where the fields of some frames are there already.
     ///
     /// Frames that are not wanted and on which no wanted one depends are neither loaded nor tracked. Fields that have to
