@@ -80,8 +80,7 @@ impl TrackingSettings {
         match quality {
             Quality::Draft => Self {
                 max_side: 400,
-                search_side: 48,
-                colour: false,
+                search_side: 80,
                 gaps: vec![1],
                 patch_side: 200,
                 patch_stride: 4,
