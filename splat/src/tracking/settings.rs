@@ -12,7 +12,7 @@ pub struct TrackingSettings {
     /// Images are halved until their longer side is at most this many pixels; 16 and up, default 800.
     pub max_side: u32,
     /// Images of the exhaustive search are halved until their longer side is at most this many pixels; 16 to 256,
-    /// default 100. Its time grows with the fourth power; 48 in the draft preset.
+    /// default 100. Its time grows with the fourth power; 80 in the draft preset.
     pub search_side: u32,
     /// Largest displacement between two frames that the exhaustive search finds, as a fraction of the width; 0 to 1,
     /// default 0.4.
