@@ -22,7 +22,6 @@ mod moments;
 mod optimise;
 mod probe;
 mod program;
-
 mod session;
 mod stages;
 #[cfg(test)]

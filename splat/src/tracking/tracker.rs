@@ -33,10 +33,7 @@ impl Tracker {
         settings: &TrackingSettings,
         emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
     ) -> Result<(), E> {
-        match self {
-            Self::BuiltIn => track_view(frame_count, load, settings, emit),
-            Self::Learned(tracker) => tracker.track_view(frame_count, load, settings, emit),
-        }
+        self.track_missing(frame_count, &|_| true, load, settings, emit)
     }
 
     /// [`Self::track_view`] where the fields of some frames are there already.
