@@ -100,6 +100,53 @@ pub(crate) mod range {
         Err(D::Error::custom(format!("{value} is not between 0 and 1")))
     }
 
+    /// A whole number within bounds.
+    pub(crate) fn whole<'de, const LEAST: u32, const MOST: u32, D: Deserializer<'de>>(
+        from: D,
+    ) -> Result<u32, D::Error> {
+        let value = u32::deserialize(from)?;
+        if (LEAST..=MOST).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not between {LEAST} and {MOST}")))
+    }
+
+    /// A correlation: -1 to 1.
+    pub(crate) fn correlation<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
+        let value = f32::deserialize(from)?;
+        if (-1.0..=1.0).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not between -1 and 1")))
+    }
+
+    /// A distance in pixels: above 0, to a million.
+    pub(crate) fn distance<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
+        let value = f32::deserialize(from)?;
+        if value > 0.0 && value <= 1e6 {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not above 0 and at most 1000000")))
+    }
+
+    /// A weight against another: 0 to a million.
+    pub(crate) fn weight<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
+        let value = f32::deserialize(from)?;
+        if (0.0..=1e6).contains(&value) {
+            return Ok(value);
+        }
+        Err(D::Error::custom(format!("{value} is not between 0 and 1000000")))
+    }
+
+    /// Distances between frames: up to 16, each 1 to 1000.
+    pub(crate) fn gaps<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<u32>, D::Error> {
+        let gaps = Vec::<u32>::deserialize(from)?;
+        if gaps.len() <= 16 && gaps.iter().all(|gap| (1..=1000).contains(gap)) {
+            return Ok(gaps);
+        }
+        Err(D::Error::custom(format!("{gaps:?} are not up to 16 distances between 1 and 1000 frames")))
+    }
+
     /// A share in double precision: 0 to 1.
     pub(crate) fn share<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
         let value = f64::deserialize(from)?;

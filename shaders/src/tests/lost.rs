@@ -8,15 +8,14 @@ use std::{
     time::Duration,
 };
 
-use splat::{
-    engine::{Engine, EngineError, Session, SessionInput, TrainingView},
-    image::Image,
-    optim::LearningRates,
-};
+use splat::engine::{Engine, EngineError, Session, SessionInput};
 
 use wgpu::{BufferDescriptor, BufferUsages, PollError, PollType};
 
-use super::support::{arc, blobs, engine, open};
+use super::{
+    BLACK, RATES, black_view,
+    support::{arc, blobs, engine, open},
+};
 use crate::{
     GpuEngine,
     buffers::{Request, allocate},
@@ -24,28 +23,8 @@ use crate::{
     transfer::read,
 };
 
-const BLACK: [f32; 3] = [0.0; 3];
-
-const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    rotation: 1e-3,
-    log_scale: 1e-3,
-    logit_opacity: 1e-3,
-    sh_dc: 1e-3,
-    sh_rest: 1e-3,
-    sh_degree: 0,
-};
-
 fn input() -> SessionInput {
-    let camera = arc(1, 17, 13).swap_remove(0);
-    let image = Arc::new(Image::filled(17, 13, BLACK));
-    SessionInput {
-        gaussians: blobs(10, 0, 1),
-        views: vec![TrainingView { camera, image, mask: None }],
-        background: BLACK,
-        dssim_weight: 0.2,
-        frozen: Vec::new(),
-    }
+    black_view(blobs(10, 0, 1), 17, 13)
 }
 
 #[test]

@@ -1,15 +1,14 @@
 //! What is held of a device's memory, and that it comes back.
 
-use std::sync::Arc;
-
 use splat::{
-    engine::{Engine, EngineError, SessionInput, TrainingView},
+    engine::{Engine, EngineError, SessionInput},
     gaussians::Gaussians,
-    image::Image,
-    optim::LearningRates,
 };
 
-use super::support::{arc, blobs, engine, open, rough_tracks};
+use super::{
+    BLACK, RATES, black_view,
+    support::{arc, blobs, engine, open, rough_tracks},
+};
 use crate::{
     GpuEngine,
     buffers::{Buffers, total},
@@ -17,28 +16,8 @@ use crate::{
     moments::taken_over,
 };
 
-const BLACK: [f32; 3] = [0.0; 3];
-
-const RATES: LearningRates = LearningRates {
-    mean: 1e-3,
-    rotation: 1e-3,
-    log_scale: 1e-3,
-    logit_opacity: 1e-3,
-    sh_dc: 1e-3,
-    sh_rest: 1e-3,
-    sh_degree: 1,
-};
-
 fn input(gaussians: Gaussians) -> SessionInput {
-    let camera = arc(1, 40, 30).swap_remove(0);
-    let image = Arc::new(Image::filled(40, 30, BLACK));
-    SessionInput {
-        gaussians,
-        views: vec![TrainingView { camera, image, mask: None }],
-        background: BLACK,
-        dssim_weight: 0.2,
-        frozen: Vec::new(),
-    }
+    black_view(gaussians, 40, 30)
 }
 
 fn held(engine: &GpuEngine) -> u64 {

@@ -189,14 +189,22 @@ pub(super) fn check_descent(engine: &GpuEngine, count: usize, degree: u32, seed:
     assert!(close(&found.sh, &expected.sh));
 }
 
+/// Gaussians of degree 3 whose 48 coefficients take more threads than the 65 535 workgroups of 256 of a row.
+const MORE_THAN_A_ROW: usize = 349_530;
+const _: () = assert!(48 * MORE_THAN_A_ROW > 65_535 * 256);
+
+#[test]
+fn descent_of_more_parameters_than_one_row_of_workgroups_is_that_of_the_cpu_engine() {
+    let Some(engine) = support::engine() else { return };
+    check_descent(engine, MORE_THAN_A_ROW, 3, 9);
+}
+
 #[test]
 fn more_values_than_one_row_of_workgroups_are_all_taken_over() {
     let Some(engine) = support::engine() else { return };
     let context = &*engine.context;
     let device = &context.device;
-    // 65 535 workgroups of 256 threads are a row; Adam's are counted by the same two functions.
-    let (count, width) = (349_530_usize, 48_usize);
-    assert!(count * width > 65_535 * 256);
+    let (count, width) = (MORE_THAN_A_ROW, 48_usize);
     let bytes = 4 * (count * width) as u64;
     let [sources, old, new] = allocate(
         device,

@@ -1,15 +1,18 @@
 //! A clock that other programs do not turn.
 
-use std::{fs, sync::LazyLock, time::Duration, time::Instant};
+use std::time::Duration;
 
-/// What this thread has spent on a processor where the system tells (Linux, to a few milliseconds), else the time since
-/// the first call.
+/// What this thread has spent on a processor where the system tells, else the time since the first call.
+#[cfg(unix)]
 pub(crate) fn now() -> Duration {
-    static START: LazyLock<Instant> = LazyLock::new(Instant::now);
-    on_processor().unwrap_or_else(|| START.elapsed())
+    let spent = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    Duration::new(spent.tv_sec.unsigned_abs(), spent.tv_nsec.unsigned_abs() as u32)
 }
 
-fn on_processor() -> Option<Duration> {
-    let statistics = fs::read_to_string("/proc/thread-self/schedstat").ok()?;
-    statistics.split_whitespace().next()?.parse().ok().map(Duration::from_nanos)
+/// What this thread has spent on a processor where the system tells, else the time since the first call.
+#[cfg(not(unix))]
+pub(crate) fn now() -> Duration {
+    use std::{sync::LazyLock, time::Instant};
+    static START: LazyLock<Instant> = LazyLock::new(Instant::now);
+    START.elapsed()
 }

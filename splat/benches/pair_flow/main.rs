@@ -17,6 +17,10 @@ use splat::{settings::Quality, tracking::TrackingSettings};
 
 use self::{clip::Clip, machine::MachineLine, measure::Frames, report::Report};
 
+/// That of the program.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 /// Milliseconds per one-way flow, and end-point errors on clips with exact flow.
 #[derive(Parser)]
 struct Arguments {

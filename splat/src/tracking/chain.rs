@@ -1,10 +1,10 @@
-//! Chaining of pair flows and choice between chains of different gaps: each pixel takes the candidate with the
-//! smallest standard deviation among those that see it (after Neoral et al., "MFT: long-term tracking of every
-//! pixel", 2024, with the uncertainties measured instead of learned).
+//! Chaining of pair flows and choice between chains of different gaps: each pixel takes the candidate that most of those
+//! that see it agree with, of those the one with the smallest standard deviation (after Neoral et al., "MFT: long-term
+//! tracking of every pixel", 2024, with the uncertainties measured instead of learned).
 
 use super::{
     consistency::{Judged, is_inside},
-    flow::Flow,
+    flow::{self, Flow},
 };
 
 /// Continues tracks from the key frame to an earlier frame by the flow from there.
@@ -20,10 +20,10 @@ pub(super) fn chain(to_earlier: &Judged, onward: &Judged) -> Judged {
             let [u, v] = to_earlier.flow.at(x, y);
             let (at_x, at_y) = (x as f32 + u, y as f32 + v);
             let corners = onward.flow.corners(at_x, at_y);
-            let step = onward.flow.sample(at_x, at_y);
+            let step = onward.flow.between(&corners);
             flow.u[i] = u + step[0];
             flow.v[i] = v + step[1];
-            let step_seen = corners.iter().all(|&(corner, weight)| weight < 0.05 || onward.visible[corner]);
+            let step_seen = flow::sees(&corners, &onward.visible);
             let inside = is_inside(x as f32 + flow.u[i], y as f32 + flow.v[i], width, height);
             visible.push(to_earlier.visible[i] && step_seen && inside);
             let fetched = |values: &[f32]| -> f32 {

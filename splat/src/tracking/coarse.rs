@@ -6,9 +6,9 @@
 use super::{
     flow::Flow,
     planes::{BORDER, Planes},
-    windows::box_mean,
+    windows::{box_mean, lanes, lanes_mut},
 };
-use crate::simd::{Instructions, Simd, simd_kernel};
+use crate::simd::{Instructions, LANES, Simd, simd_kernel};
 
 /// The best match of every pixel of one image in the other, in pixels of the searched level; not a number where it
 /// does not lead back.
@@ -19,38 +19,41 @@ pub(super) struct CoarseMatches {
 
 /// Half side of the compared windows.
 const RADIUS: usize = 2;
+/// Their side.
+const SIDE: usize = 2 * RADIUS + 1;
 /// Half side of the windows whose mean is removed first. Wide, so that a patch keeps its colour.
 const HIGH_PASS_RADIUS: usize = 6;
 
 /// Largest distance along either axis between a pixel and where it comes back to, pixels.
 const ROUND_TRIP: f32 = 1.0;
 
+/// The best match of every pixel so far. Longer than the image by a group of lanes, as rows are not whole groups.
 struct Best {
     cost: Vec<f32>,
-    label: Vec<u32>,
+    /// Number of the displacement; a float, so that it is chosen like the cost. At most 513² of them are exact.
+    label: Vec<f32>,
 }
 
 impl Best {
     fn new(pixels: usize) -> Self {
-        Self { cost: vec![f32::INFINITY; pixels], label: vec![0; pixels] }
+        Self { cost: vec![f32::INFINITY; pixels + LANES], label: vec![0.0; pixels + LANES] }
     }
 
     #[inline(always)]
-    fn offer(&mut self, first: usize, costs: &[f32], label: u32) {
-        let best = &mut self.cost[first..first + costs.len()];
-        let labels = &mut self.label[first..first + costs.len()];
-        for i in 0..costs.len() {
-            labels[i] = if costs[i] < best[i] { label } else { labels[i] };
-            best[i] = if costs[i] < best[i] { costs[i] } else { best[i] };
-        }
+    fn offer<S: Simd>(&mut self, first: usize, cost: S, label: S) {
+        let (best, labels) = (lanes_mut(&mut self.cost, first), lanes_mut(&mut self.label, first));
+        let known = S::load(best);
+        let better = cost.lt(known);
+        S::select(better, cost, known).store(best);
+        S::select(better, label, S::load(labels)).store(labels);
     }
 
     fn into_flow(self, width: usize, displacements: &[[i32; 2]], sign: f32) -> Flow {
-        let height = self.label.len() / width;
+        let labels = &self.label[..self.label.len() - LANES];
         let axis = |axis: usize| -> Vec<f32> {
-            self.label.iter().map(|&label| sign * displacements[label as usize][axis] as f32).collect()
+            labels.iter().map(|&label| sign * displacements[label as usize][axis] as f32).collect()
         };
-        Flow { width, height, u: axis(0), v: axis(1) }
+        Flow { width, height: labels.len() / width, u: axis(0), v: axis(1) }
     }
 }
 
@@ -103,42 +106,51 @@ fn compare_kernel<S: Simd, const C: usize>(
     displacements: &[[i32; 2]],
     matches: &mut [Best; 2],
 ) {
-    let (width, height) = (images[0].width, images[0].height);
+    let width = images[0].width;
     let mut scratch = Scratch::default();
-    let mut energies = [vec![0.0f32; width * height], vec![0.0f32; width * height]];
-    for (image, energy) in images.iter().zip(&mut energies) {
-        let overlap = Overlap::new(image, [0, 0]);
-        scratch.sum_rows(image, image, &overlap);
-        for y in 0..height {
-            scratch.sum_columns(y, width);
-            energy[y * width..(y + 1) * width].copy_from_slice(&scratch.row[..width]);
-        }
-    }
+    let energies = images.each_ref().map(|image| energy::<S, C>(image, &mut scratch));
+    let steps: [f32; LANES] = std::array::from_fn(|lane| lane as f32);
+    let (steps, nothing) = (S::load(&steps), S::splat(f32::INFINITY));
     let [forward, backward] = matches;
     for (label, &[dx, dy]) in displacements.iter().enumerate() {
         let overlap = Overlap::new(&images[0], [dx, dy]);
-        let columns = overlap.columns;
-        scratch.sum_rows(&images[0], &images[1], &overlap);
+        let label = S::splat(label as f32);
+        scratch.sum_rows::<S, C>(&images[0], &images[1], &overlap);
         for line in 0..overlap.rows {
-            scratch.sum_columns(line, columns);
             let at_first = (overlap.first_row + line) * width + overlap.first_column;
             let at_second = (at_first as i64 + i64::from(dy) * width as i64 + i64::from(dx)) as usize;
-            let first_energy = &energies[0][at_first..at_first + columns];
-            let second_energy = &energies[1][at_second..at_second + columns];
-            let costs = &mut scratch.row[..columns];
-            for i in 0..columns {
-                costs[i] = (first_energy[i] + second_energy[i]) - 2.0 * costs[i];
+            for column in (0..overlap.columns).step_by(LANES) {
+                let (first, second) = (at_first + column, at_second + column);
+                let both = S::load(lanes(&energies[0], first)).add(S::load(lanes(&energies[1], second)));
+                let product = scratch.window::<S>(line, column);
+                // Rounding must not make a difference better than none.
+                let cost = both.sub(product.add(product)).max(S::splat(0.0));
+                let is_inside = steps.lt(S::splat((overlap.columns - column) as f32));
+                let cost = S::select(is_inside, cost, nothing);
+                forward.offer(first, cost, label);
+                backward.offer(second, cost, label);
             }
-            forward.offer(at_first, costs, label as u32);
-            backward.offer(at_second, costs, label as u32);
         }
     }
 }
 
-/// Binomial smoothing: a displacement of half a coarse pixel must not hide a match.
+/// The window sums of the squares of an image, and a group of lanes more.
+#[inline(always)]
+fn energy<S: Simd, const C: usize>(image: &Planes<C>, scratch: &mut Scratch) -> Vec<f32> {
+    let mut energy = vec![0.0f32; image.width * image.height + LANES];
+    scratch.sum_rows::<S, C>(image, image, &Overlap::new(image, [0, 0]));
+    for y in 0..image.height {
+        for x in (0..image.width).step_by(LANES) {
+            // What is written beyond the row's end the next row overwrites.
+            scratch.window::<S>(y, x).store(lanes_mut(&mut energy, y * image.width + x));
+        }
+    }
+    energy
+}
+
+/// Smoothed a little: a displacement of half a coarse pixel must not hide a match.
 fn smoothed<const C: usize>(planes: &Planes<C>) -> Planes<C> {
     let interiors = planes.interiors().map(|channel| {
-        // Two box filters of different size approximate the binomial well enough.
         let (width, height) = (planes.width, planes.height);
         let box3 = box_mean(&channel, width, height, 1);
         channel.iter().zip(&box3).map(|(value, mean)| 0.5 * (value + mean)).collect()
@@ -175,54 +187,56 @@ impl Overlap {
     }
 }
 
-/// Window sums of the products of two images, one shifted, computed without allocating per displacement.
+/// Window sums of the products of two images, one shifted, computed without allocating per displacement. Rows are
+/// filled up to whole groups of lanes with anything.
 #[derive(Default)]
 struct Scratch {
     products: Vec<f32>,
+    /// Sums along rows, from `RADIUS` rows before the overlap to as many after it.
     sums: Vec<f32>,
-    row: Vec<f32>,
+    columns: usize,
 }
 
 impl Scratch {
-    /// Sums along the rows of `first` that `second`, shifted, overlaps, and of `RADIUS` rows before and after.
+    /// Sums along the rows of `first` that `second`, shifted, overlaps.
+    ///
+    /// Reads up to two groups of lanes beyond the end of a row: the border below has them.
     #[inline(always)]
-    fn sum_rows<const C: usize>(&mut self, first: &Planes<C>, second: &Planes<C>, overlap: &Overlap) {
-        let columns = overlap.columns;
-        let padded = columns + 2 * RADIUS;
+    fn sum_rows<S: Simd, const C: usize>(
+        &mut self,
+        first: &Planes<C>,
+        second: &Planes<C>,
+        overlap: &Overlap,
+    ) {
+        self.columns = overlap.columns.next_multiple_of(LANES);
+        let padded = self.columns + LANES;
         let [dx, dy] = overlap.displacement.map(i64::from);
         self.products.resize(padded, 0.0);
-        self.sums.resize((overlap.rows + 2 * RADIUS) * columns, 0.0);
-        self.row.resize(columns, 0.0);
-        for (line, sums) in self.sums.chunks_exact_mut(columns).enumerate() {
+        self.sums.resize((overlap.rows + 2 * RADIUS) * self.columns, 0.0);
+        for (line, sums) in self.sums.chunks_exact_mut(self.columns).enumerate() {
             let row = overlap.first_row + line + BORDER - RADIUS;
             let at = row * first.stride + overlap.first_column + BORDER - RADIUS;
             let shifted = (at as i64 + dy * second.stride as i64 + dx) as usize;
-            let products = &mut self.products[..padded];
-            products.fill(0.0);
-            for (a, b) in first.channels.iter().zip(&second.channels) {
-                let (a, b) = (&a[at..at + padded], &b[shifted..shifted + padded]);
-                for i in 0..padded {
-                    products[i] += a[i] * b[i];
+            for column in (0..padded).step_by(LANES) {
+                let mut product = S::splat(0.0);
+                for (a, b) in first.channels.iter().zip(&second.channels) {
+                    let (a, b) = (S::load(lanes(a, at + column)), S::load(lanes(b, shifted + column)));
+                    product = a.mul_add(b, product);
                 }
+                product.store(lanes_mut(&mut self.products, column));
             }
-            let (a, b, c) = (&products[..columns], &products[1..][..columns], &products[2..][..columns]);
-            let (d, e) = (&products[3..][..columns], &products[4..][..columns]);
-            for i in 0..columns {
-                sums[i] = a[i] + b[i] + c[i] + d[i] + e[i];
+            for (block, to) in sums.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+                let product = |shift: usize| S::load(lanes(&self.products, block * LANES + shift));
+                (1..SIDE).fold(product(0), |sum, shift| sum.add(product(shift))).store(to);
             }
         }
     }
 
-    /// Sums of the rows of sums around the given one, in `row`.
+    /// Sums over the windows around [`LANES`] pixels of a line of the overlap.
     #[inline(always)]
-    fn sum_columns(&mut self, line: usize, columns: usize) {
-        let sums = &self.sums[line * columns..(line + 2 * RADIUS + 1) * columns];
-        let (a, b, c) = (&sums[..columns], &sums[columns..][..columns], &sums[2 * columns..][..columns]);
-        let (d, e) = (&sums[3 * columns..][..columns], &sums[4 * columns..][..columns]);
-        let row = &mut self.row[..columns];
-        for i in 0..columns {
-            row[i] = a[i] + b[i] + c[i] + d[i] + e[i];
-        }
+    fn window<S: Simd>(&self, line: usize, column: usize) -> S {
+        let row = |shift: usize| S::load(lanes(&self.sums, (line + shift) * self.columns + column));
+        (1..SIDE).fold(row(0), |sum, shift| sum.add(row(shift)))
     }
 }
 

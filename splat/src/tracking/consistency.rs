@@ -4,8 +4,8 @@ use super::{
     TrackingSettings,
     flow::Flow,
     pair::Frame,
-    planes::{PATCH, box_counts, box_sum},
-    refine::residuals,
+    planes::{PATCH, Planes},
+    windows::{box_counts, box_sum},
 };
 
 /// A flow with the doubts about it, per pixel.
@@ -70,11 +70,8 @@ pub(super) struct Agreement {
 pub(super) fn agreement(first: &Frame, second: &Frame, flow: &Flow) -> Agreement {
     let (width, height) = (flow.width, flow.height);
     let counts = box_counts(width, height, WINDOW);
-    let here = first.levels[0].interiors();
-    let there: [Vec<f32>; 3] = {
-        let differences = residuals(&first.levels[0], &second.levels[0], flow);
-        std::array::from_fn(|c| here[c].iter().zip(&differences[c]).map(|(a, d)| a + d).collect())
-    };
+    let here = first.colours.interiors();
+    let there = fetched(&second.colours, flow);
     let sum = |values: &[f32]| box_sum(values, width, height, WINDOW);
     let products = |a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]| -> Vec<f32> {
         sum(&(0..width * height)
@@ -110,11 +107,23 @@ impl Agreement {
     }
 }
 
-/// Smaller eigenvalue of the structure tensor around each pixel of the finest level, summed over channels and a
-/// window of about a patch.
-pub(super) fn texture(frame: &Frame) -> Vec<f32> {
-    let (width, height) = (frame.width(), frame.height());
-    let [gx, gy] = frame.gradients[0].each_ref().map(|planes| planes.interiors());
+/// What an image shows along a flow.
+fn fetched(image: &Planes, flow: &Flow) -> [Vec<f32>; 3] {
+    let mut channels = [(); 3].map(|()| Vec::with_capacity(flow.u.len()));
+    for y in 0..flow.height {
+        for x in 0..flow.width {
+            let [u, v] = flow.at(x, y);
+            let colour = image.colour_at(x as f32 + u, y as f32 + v);
+            channels.iter_mut().zip(colour).for_each(|(channel, value)| channel.push(value));
+        }
+    }
+    channels
+}
+
+/// Smaller eigenvalue of the structure tensor around each pixel, summed over channels and a window of about a patch.
+pub(super) fn texture(colours: &Planes) -> Vec<f32> {
+    let (width, height) = (colours.width, colours.height);
+    let [gx, gy] = colours.gradients().map(|planes| planes.interiors());
     let tensor = |a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]| {
         let products: Vec<f32> =
             (0..width * height).map(|i| a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i]).collect();
@@ -147,7 +156,6 @@ pub(super) fn judge(
     second: &Frame,
     flow: Flow,
     back: &Flow,
-    texture: &[f32],
     settings: &TrackingSettings,
 ) -> Judged {
     let error = round_trip(&flow, back);
@@ -162,7 +170,7 @@ pub(super) fn judge(
             visible
                 .push(inside && error[i] < settings.consistency && agreement.holds(i, settings.correlation));
             let noise = agreement.residual[i].max(4.0);
-            let variance = TRIP * error[i] * error[i] + NOISE_SHARE * noise / (texture[i] + 1e-3);
+            let variance = TRIP * error[i] * error[i] + NOISE_SHARE * noise / (first.texture[i] + 1e-3);
             sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
         }
     }

@@ -1,5 +1,7 @@
 //! One displacement per pixel from overlapping patches.
 
+use std::collections::VecDeque;
+
 use super::{
     flow::Flow,
     patches::{PATCH_PIXELS, PatchField, Window, line, totals},
@@ -66,6 +68,9 @@ simd_kernel! {
 /// Rows of a patch that a group of lanes holds.
 const PAIRS: usize = PATCH / 2;
 
+/// The weights of the pixels of a row of patches.
+type RowWeights = Vec<[f32; PATCH_PIXELS]>;
+
 #[inline(always)]
 fn paint_kernel<S: Simd, const C: usize>(
     reference: &Planes<C>,
@@ -73,50 +78,80 @@ fn paint_kernel<S: Simd, const C: usize>(
     field: &PatchField,
     canvas: &mut Canvas,
 ) {
-    let mut weights = vec![[0.0f32; PATCH_PIXELS]; field.displacement.len()];
-    let width = canvas.width;
-    for (j, &y) in field.ys.iter().enumerate() {
-        for (i, &x) in field.xs.iter().enumerate() {
-            let at = j * field.columns + i;
-            let displacement = field.displacement[at];
-            pixel_weights::<S, C>(reference, target, [x, y], displacement, field.cost[at], &mut weights[at]);
-            let [u, v] = [S::splat(displacement[0]), S::splat(displacement[1])];
-            let [best_u, best_v] = &mut canvas.best;
-            for pair in 0..PAIRS {
-                let first = (y + 2 * pair) * width + x;
-                let weight = group::<S>(&weights[at], LANES * pair, PATCH);
-                let best: S = group(&canvas.best_weight, first, width);
-                let better = best.lt(weight);
-                put(S::select(better, weight, best), &mut canvas.best_weight, first, width);
-                put(S::select(better, u, group(best_u, first, width)), best_u, first, width);
-                put(S::select(better, v, group(best_v, first, width)), best_v, first, width);
+    // Weights are kept only until every patch has been seen that shares a pixel with theirs.
+    let mut waiting: VecDeque<(usize, RowWeights)> = VecDeque::new();
+    let mut spare: Vec<RowWeights> = Vec::new();
+    for row in 0..field.ys.len() {
+        let mut weights = spare.pop().unwrap_or_else(|| vec![[0.0; PATCH_PIXELS]; field.columns]);
+        choose_best::<S, C>(reference, target, field, row, &mut weights, canvas);
+        waiting.push_back((row, weights));
+        let next = field.ys.get(row + 1).copied();
+        while let Some(&(first, _)) = waiting.front() {
+            if next.is_some_and(|next| next < field.ys[first] + PATCH) {
+                break;
             }
-        }
-    }
-    let (zero, near, far) = (S::splat(0.0), S::splat(SAME_MOTION), S::splat(-SAME_MOTION));
-    for (j, &y) in field.ys.iter().enumerate() {
-        for (i, &x) in field.xs.iter().enumerate() {
-            let at = j * field.columns + i;
-            let [u, v] = [S::splat(field.displacement[at][0]), S::splat(field.displacement[at][1])];
-            let [sum_u, sum_v] = &mut canvas.sum;
-            for pair in 0..PAIRS {
-                let first = (y + 2 * pair) * width + x;
-                let weight = group::<S>(&weights[at], LANES * pair, PATCH);
-                let off_u = u.sub(group(&canvas.best[0], first, width));
-                let off_v = v.sub(group(&canvas.best[1], first, width));
-                let agrees_u = S::both(near.ge(off_u), off_u.ge(far));
-                let agrees_v = S::both(near.ge(off_v), off_v.ge(far));
-                let weight = S::select(S::both(agrees_u, agrees_v), weight, zero);
-                put(weight.mul_add(u, group(sum_u, first, width)), sum_u, first, width);
-                put(weight.mul_add(v, group(sum_v, first, width)), sum_v, first, width);
-                put(weight.add(group(&canvas.total, first, width)), &mut canvas.total, first, width);
-            }
+            let Some((first, weights)) = waiting.pop_front() else { break };
+            add_agreeing::<S>(field, first, &weights, canvas);
+            spare.push(weights);
         }
     }
     // Every pixel is covered, and weights are positive.
     for axis in &mut canvas.sum {
         for (value, total) in axis.iter_mut().zip(&canvas.total) {
             *value /= total;
+        }
+    }
+}
+
+/// Weighs the pixels of a row of patches, and notes the motion of those that explain a pixel best so far.
+#[inline(always)]
+fn choose_best<S: Simd, const C: usize>(
+    reference: &Planes<C>,
+    target: &Planes<C>,
+    field: &PatchField,
+    row: usize,
+    weights: &mut RowWeights,
+    canvas: &mut Canvas,
+) {
+    let (width, y) = (canvas.width, field.ys[row]);
+    for (i, &x) in field.xs.iter().enumerate() {
+        let at = row * field.columns + i;
+        let displacement = field.displacement[at];
+        pixel_weights::<S, C>(reference, target, [x, y], displacement, field.cost[at], &mut weights[i]);
+        let [u, v] = [S::splat(displacement[0]), S::splat(displacement[1])];
+        let [best_u, best_v] = &mut canvas.best;
+        for pair in 0..PAIRS {
+            let first = (y + 2 * pair) * width + x;
+            let weight = group::<S>(&weights[i], LANES * pair, PATCH);
+            let best: S = group(&canvas.best_weight, first, width);
+            let better = best.lt(weight);
+            put(S::select(better, weight, best), &mut canvas.best_weight, first, width);
+            put(S::select(better, u, group(best_u, first, width)), best_u, first, width);
+            put(S::select(better, v, group(best_v, first, width)), best_v, first, width);
+        }
+    }
+}
+
+/// Adds a row of patches to the pixels whose best motion is theirs.
+#[inline(always)]
+fn add_agreeing<S: Simd>(field: &PatchField, row: usize, weights: &RowWeights, canvas: &mut Canvas) {
+    let (width, y) = (canvas.width, field.ys[row]);
+    let (zero, near, far) = (S::splat(0.0), S::splat(SAME_MOTION), S::splat(-SAME_MOTION));
+    for (i, &x) in field.xs.iter().enumerate() {
+        let [u, v] = field.displacement[row * field.columns + i];
+        let [u, v] = [S::splat(u), S::splat(v)];
+        let [sum_u, sum_v] = &mut canvas.sum;
+        for pair in 0..PAIRS {
+            let first = (y + 2 * pair) * width + x;
+            let weight = group::<S>(&weights[i], LANES * pair, PATCH);
+            let off_u = u.sub(group(&canvas.best[0], first, width));
+            let off_v = v.sub(group(&canvas.best[1], first, width));
+            let agrees_u = S::both(near.ge(off_u), off_u.ge(far));
+            let agrees_v = S::both(near.ge(off_v), off_v.ge(far));
+            let weight = S::select(S::both(agrees_u, agrees_v), weight, zero);
+            put(weight.mul_add(u, group(sum_u, first, width)), sum_u, first, width);
+            put(weight.mul_add(v, group(sum_v, first, width)), sum_v, first, width);
+            put(weight.add(group(&canvas.total, first, width)), &mut canvas.total, first, width);
         }
     }
 }

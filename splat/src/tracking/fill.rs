@@ -15,9 +15,12 @@ const REACH: isize = 2;
 /// `colours` are the key frame's channels, 0 to 255.
 pub(super) fn fill_hidden(tracks: &mut Judged, colours: &[Vec<f32>; 3]) {
     let mut known = tracks.visible.clone();
+    if !known.contains(&true) {
+        return;
+    }
     for uses_colour in [true, false] {
         let mut step = 1;
-        while step <= tracks.flow.width.max(tracks.flow.height) {
+        while known.contains(&false) && step <= tracks.flow.width.max(tracks.flow.height) {
             fill_from(tracks, &mut known, step, |a, b| {
                 if !uses_colour {
                     return 1.0;

@@ -36,7 +36,11 @@ impl Flow {
 
     /// The displacement at fractional index `(x, y)`, bilinear, clamped to the image.
     pub(super) fn sample(&self, x: f32, y: f32) -> [f32; 2] {
-        let corners = self.corners(x, y);
+        self.between(&self.corners(x, y))
+    }
+
+    /// The displacement between the pixels that [`Self::corners`] has given.
+    pub(super) fn between(&self, corners: &[(usize, f32); 4]) -> [f32; 2] {
         [&self.u, &self.v].map(|axis| corners.iter().map(|&(i, weight)| weight * axis[i]).sum())
     }
 
@@ -63,4 +67,12 @@ impl Flow {
         }
         (1u32 << halvings) as f32
     }
+}
+
+/// Least weight of a pixel that counts.
+const LEAST_WEIGHT: f32 = 0.05;
+
+/// Whether a place between the pixels that [`Flow::corners`] has given is seen: all that count are.
+pub(super) fn sees(corners: &[(usize, f32); 4], visible: &[bool]) -> bool {
+    corners.iter().all(|&(corner, weight)| weight < LEAST_WEIGHT || visible[corner])
 }

@@ -3,12 +3,13 @@
 //! Each pair of frames is matched both ways: exhaustive search on a small image for jumps, dense inverse search down
 //! a pyramid, variational refinement. Forward-backward and photometric agreement decide what is visible and how
 //! certain. Tracks to a frame are the direct match with the key frame or a continuation of an earlier frame's
-//! tracks, per pixel whichever is more certain.
+//! tracks, per pixel what most of them agree on, then whichever is more certain.
 
 mod chain;
 mod coarse;
 mod consistency;
 mod densify;
+mod exposure;
 mod fill;
 mod flow;
 pub mod learned;

@@ -1,8 +1,11 @@
 //! Dense flow between two frames of a view, both ways.
 
+use std::sync::Arc;
+
 use super::{
     TrackingSettings,
     coarse::{self, CoarseMatches},
+    consistency::texture,
     densify::densify,
     flow::Flow,
     patches::{self, Guess, PatchField},
@@ -17,7 +20,7 @@ const EDGE_SCALE: f32 = 40.0;
 
 /// One level of a frame's pyramid.
 pub(super) struct Level<const C: usize> {
-    pub(super) planes: Planes<C>,
+    pub(super) planes: Arc<Planes<C>>,
     pub(super) texels: Texels<C>,
     /// How alike each pixel is to its left and to its upper neighbour, 1 where equal; 0 where there is none.
     pub(super) similarity: [Vec<f32>; 2],
@@ -28,7 +31,7 @@ impl<const C: usize> Level<C> {
         let level = |planes: Planes<C>| {
             let texels = Texels::new(&planes);
             let similarity = similarity(&planes);
-            Self { planes, texels, similarity }
+            Self { planes: Arc::new(planes), texels, similarity }
         };
         pyramid(finest, settings.search_side as usize).into_iter().map(level).collect()
     }
@@ -66,7 +69,7 @@ fn similarity<const C: usize>(planes: &Planes<C>) -> [Vec<f32>; 2] {
 pub(super) struct Pyramid {
     levels: Levels,
     /// The image of the exhaustive search, in colour.
-    searched: Planes,
+    searched: Arc<Planes>,
 }
 
 /// Finest level first.
@@ -78,15 +81,15 @@ pub(super) enum Levels {
 impl Pyramid {
     /// The pyramid of an image that has pixels.
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        let halvings = halvings(image, settings.max_side);
+        let halvings = halvings(image, settings);
         let levels = if settings.colour {
             Levels::Colour(Level::pyramid(Planes::from_image(image, halvings), settings))
         } else {
             Levels::Luma(Level::pyramid(Planes::luma_of(image, halvings), settings))
         };
         let searched = match &levels {
-            Levels::Luma(levels) => Planes::from_image(image, halvings + levels.len() as u32 - 1),
-            Levels::Colour(levels) => levels[levels.len() - 1].planes.clone(),
+            Levels::Luma(levels) => Arc::new(Planes::from_image(image, halvings + levels.len() as u32 - 1)),
+            Levels::Colour(levels) => Arc::clone(&levels[levels.len() - 1].planes),
         };
         Self { levels, searched }
     }
@@ -100,39 +103,42 @@ impl Pyramid {
     }
 }
 
-/// How often an image is halved until its longer side has at most so many pixels.
-fn halvings(image: &Image, side: u32) -> u32 {
+/// How often an image is halved before it is matched.
+fn halvings(image: &Image, settings: &TrackingSettings) -> u32 {
     let longer = image.width.max(image.height);
-    (0..31).find(|halvings| longer.div_ceil(1 << halvings) <= side.max(2)).unwrap_or(31)
+    let at_least = u32::from(longer > settings.full_side);
+    let fits = |&halvings: &u32| longer.div_ceil(1 << halvings) <= settings.max_side.max(2);
+    (at_least..31).find(fits).unwrap_or(31)
 }
 
 /// A frame, prepared for matching and for comparison.
 pub(super) struct Frame {
+    /// How well a displacement of each pixel of the finest level can be told: the smaller eigenvalue of the structure
+    /// tensor.
+    pub(super) texture: Vec<f32>,
     /// The finest level, in colour.
-    pub(super) levels: [Planes; 1],
-    /// Its gradients along x and y.
-    pub(super) gradients: [[Planes; 2]; 1],
+    pub(super) colours: Arc<Planes>,
     pyramid: Pyramid,
 }
 
 impl Frame {
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
         let pyramid = Pyramid::new(image, settings);
-        let finest = match &pyramid.levels {
-            Levels::Colour(levels) => levels[0].planes.clone(),
-            Levels::Luma(_) => Planes::from_image(image, halvings(image, settings.max_side)),
+        let colours = match &pyramid.levels {
+            Levels::Colour(levels) => Arc::clone(&levels[0].planes),
+            Levels::Luma(_) => Arc::new(Planes::from_image(image, halvings(image, settings))),
         };
-        Self { gradients: [finest.gradients()], levels: [finest], pyramid }
+        Self { texture: texture(&colours), colours, pyramid }
     }
 
     /// Columns of the finest level.
     pub(super) fn width(&self) -> usize {
-        self.levels[0].width
+        self.colours.width
     }
 
     /// Rows of the finest level.
     pub(super) fn height(&self) -> usize {
-        self.levels[0].height
+        self.colours.height
     }
 
     /// `flow` to another frame, refined at the finest level where `trust` says that colour counts.
@@ -230,18 +236,11 @@ fn descend_pyramid<const C: usize>(
 ) -> Flow {
     let coarsest = from.len() - 1;
     let smoothing = Smoothing::of(settings);
-    let mut flow: Option<Flow> = None;
-    for level in (0..=coarsest).rev() {
+    let match_level = |level: usize, coarser: Option<&Flow>| {
         let (reference, target) = (&from[level], &to[level]);
         let planes = &reference.planes;
-        if level < coarsest && planes.width.max(planes.height) > settings.patch_side as usize {
-            let coarser = flow.unwrap_or_else(|| seeds.clone());
-            let start = coarser.doubled(planes.width, planes.height);
-            flow = Some(refine(instructions, reference, target, start, None, smoothing));
-            continue;
-        }
         let mut guesses = Vec::new();
-        guesses.extend(flow.as_ref().map(|flow| Guess { flow, scale: 2.0 }));
+        guesses.extend(coarser.map(|flow| Guess { flow, scale: 2.0 }));
         let scale = 1.0 / (1u32 << level) as f32;
         guesses.extend(guide.map(|guide| Guess { scale: guide.scale * scale, ..guide }));
         let seeds = (level == coarsest).then_some(Guess { flow: seeds, scale: 1.0 });
@@ -257,7 +256,17 @@ fn descend_pyramid<const C: usize>(
             &mut field,
         );
         let dense = densify(instructions, planes, &target.planes, &field);
-        flow = Some(refine(instructions, reference, target, dense, None, smoothing));
+        refine(instructions, reference, target, dense, None, smoothing)
+    };
+    let mut flow = match_level(coarsest, None);
+    for level in (0..coarsest).rev() {
+        let (reference, target) = (&from[level], &to[level]);
+        let [width, height] = reference.planes.size();
+        flow = if width.max(height) > settings.patch_side as usize {
+            refine(instructions, reference, target, flow.doubled(width, height), None, smoothing)
+        } else {
+            match_level(level, Some(&flow))
+        };
     }
-    flow.unwrap_or_else(|| seeds.clone())
+    flow
 }

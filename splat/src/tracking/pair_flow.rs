@@ -2,6 +2,7 @@
 
 use super::{
     TrackingSettings,
+    exposure::Exposure,
     flow::Flow,
     pair::{Guides, Pyramid, match_pyramids},
 };
@@ -71,6 +72,7 @@ pub fn pair_flow(
         return Ok(PairFlow { forward: nothing.clone(), backward: nothing });
     }
     let instructions = Instructions::detect();
+    let second = &*Exposure::of(first).equalised(second);
     let (first, second) = rayon::join(|| Pyramid::new(first, settings), || Pyramid::new(second, settings));
     let initial = initial.map(|initial| (initial.forward.planar(), initial.backward.planar()));
     let scale = Flow::reduction([size.0 as usize, size.1 as usize], first.size());

@@ -176,6 +176,13 @@ fn products<S: Simd>(a: &Pixels<S>, b: &Pixels<S>) -> S {
     upper.add(lower)
 }
 
+/// The sum of squares of a patch whose mean counts little.
+#[inline(always)]
+fn without_mean(squares: f32, total: f32) -> f32 {
+    let share = (1.0 - MEAN_WEIGHT) / PATCH_PIXELS as f32;
+    (squares - share * total * total).max(0.0)
+}
+
 /// A patch of the reference, its gradients without their mean, and the inverse of the damped Gauss-Newton matrix.
 struct Template<S, const C: usize> {
     channels: [[Pixels<S>; 3]; C],
@@ -241,8 +248,7 @@ impl<S: Simd, const C: usize> Template<S, C> {
                 products(&off, &template[1]),
                 products(&off, &template[2]),
             ]);
-            let mean_share = (1.0 - MEAN_WEIGHT) / PATCH_PIXELS as f32;
-            comparison.cost += (squares - mean_share * total * total).max(0.0);
+            comparison.cost += without_mean(squares, total);
             comparison.right[0] += along_x;
             comparison.right[1] += along_y;
         }
@@ -258,31 +264,53 @@ impl<S: Simd, const C: usize> Template<S, C> {
         [xx * right[0] + xy * right[1], xy * right[0] + yy * right[1]]
     }
 
-    /// The best of the candidates, improved by descent if it is not the first or the first is to be improved too.
+    /// The cost of [`Self::compare`] if it is below `bound`, else at least that.
+    #[inline(always)]
+    fn cost_below(&self, bound: f32, target: &Planes<C>, x: f32, y: f32) -> f32 {
+        let window = Window::<S>::new(target, x, y);
+        let mut cost = 0.0;
+        for (template, channel) in self.channels.iter().zip(&target.channels) {
+            let mut off = window.fetch(channel, target.stride);
+            for pair in 0..GROUPS {
+                off[pair] = off[pair].sub(template[0][pair]);
+            }
+            let none = S::splat(0.0);
+            let [total, squares, ..] = totals([sum(&off), products(&off, &off), none, none]);
+            cost += without_mean(squares, total);
+            if cost >= bound {
+                return cost;
+            }
+        }
+        cost
+    }
+
+    /// The best of the candidates, improved by descent. Where the cost of the first is `known`, that one was improved
+    /// before.
     #[inline(always)]
     fn improve(
         &self,
         target: &Planes<C>,
         [x, y]: [f32; 2],
         candidates: &Candidates,
+        known: Option<f32>,
         iterations: u32,
-        improve_first: bool,
     ) -> ([f32; 2], f32) {
-        let mut start = candidates.list[0];
-        let mut best = self.compare(target, x + start[0], y + start[1]);
-        let mut is_first = true;
+        let first = candidates.list[0];
+        let mut start = first;
+        let mut cost =
+            known.unwrap_or_else(|| self.cost_below(f32::INFINITY, target, x + first[0], y + first[1]));
         for n in 1..candidates.count {
             let candidate = candidates.list[n];
-            let comparison = self.compare(target, x + candidate[0], y + candidate[1]);
-            let bound =
-                if n < candidates.trusted { best.cost } else { LEAST_GAIN * best.cost - LEAST_DIFFERENCE };
-            if comparison.cost < bound {
-                (start, best, is_first) = (candidate, comparison, false);
+            let bound = if n < candidates.trusted { cost } else { LEAST_GAIN * cost - LEAST_DIFFERENCE };
+            let found = self.cost_below(bound, target, x + candidate[0], y + candidate[1]);
+            if found < bound {
+                (start, cost) = (candidate, found);
             }
         }
-        if is_first && !improve_first {
-            return (start, best.cost);
+        if known.is_some() && start == first {
+            return (start, cost);
         }
+        let best = self.compare(target, x + start[0], y + start[1]);
         self.descend(target, [x, y], start, best, iterations)
     }
 
@@ -389,7 +417,7 @@ fn search_kernel<S: Simd, const C: usize>(
             let template = Template::<S, C>::new(reference, x, y);
             let corner = [x as f32, y as f32];
             (field.displacement[at], field.cost[at]) =
-                template.improve(target, corner, &candidates, iterations, true);
+                template.improve(target, corner, &candidates, None, iterations);
         }
     }
     for j in (0..rows).rev() {
@@ -411,7 +439,7 @@ fn search_kernel<S: Simd, const C: usize>(
             let template = Template::<S, C>::new(reference, field.xs[i], field.ys[j]);
             let corner = [field.xs[i] as f32, field.ys[j] as f32];
             (field.displacement[at], field.cost[at]) =
-                template.improve(target, corner, &candidates, iterations, false);
+                template.improve(target, corner, &candidates, Some(field.cost[at]), iterations);
         }
     }
 }

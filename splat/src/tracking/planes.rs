@@ -1,6 +1,6 @@
 //! Channels of an image with a replicated border, and their pyramid.
 
-pub(super) use super::windows::{box_counts, box_mean, box_sum};
+use super::windows::box_mean;
 use crate::image::Image;
 
 /// Side of a patch, pixels. A constant, so that the loops over a patch have a known length and vectorise.

@@ -1,8 +1,8 @@
 //! Variational refinement: robust colour constancy against edge-aware smoothness, linearised around the given flow.
 //! It fills untextured areas from their surroundings and takes the patch grid out of the flow.
 
-use super::{TrackingSettings, flow::Flow, pair::Level, planes::Planes, windows::average_windows};
-use crate::simd::{Instructions, Simd, simd_kernel};
+use super::{TrackingSettings, flow::Flow, pair::Level, windows::average_windows};
+use crate::simd::{Instructions, LANES, Simd, simd_kernel};
 
 /// Residual at which the data term turns from quadratic to linear, 0 to 255 scale.
 const RESIDUAL_SCALE: f32 = 4.0;
@@ -111,18 +111,48 @@ fn warp_kernel<S: Simd, const C: usize>(
     flow: &Flow,
     linear: &mut Linearised<C>,
 ) {
+    let steps: [f32; LANES] = std::array::from_fn(|lane| lane as f32);
+    let steps = S::load(&steps);
     for y in 0..flow.height {
-        for x in 0..flow.width {
-            let i = y * flow.width + x;
+        for x in (0..flow.width).step_by(LANES) {
+            let count = LANES.min(flow.width - x);
+            let pixels = y * flow.width + x..y * flow.width + x + count;
+            let along = |axis: &[f32]| some::<S>(&axis[pixels.clone()]);
+            let at_x = along(&flow.u).add(steps).add(S::splat(x as f32));
+            let at_y = along(&flow.v).add(S::splat(y as f32));
             // The target's gradients: those of the reference are turned and sheared against it.
-            let sample = target.texels.sample(x as f32 + flow.u[i], y as f32 + flow.v[i]);
-            for (c, [value, along_x, along_y, _]) in sample.into_iter().enumerate() {
-                linear.residual[c][i] = value - reference.planes.channels[c][reference.planes.index(x, y)];
-                linear.along_x[c][i] = along_x;
-                linear.along_y[c][i] = along_y;
+            let sample = target.texels.sample(at_x, at_y);
+            for (c, [value, along_x, along_y]) in sample.into_iter().enumerate() {
+                let here = some::<S>(&reference.planes.row(c, y)[x..x + count]);
+                put(value.sub(here), &mut linear.residual[c][pixels.clone()]);
+                put(along_x, &mut linear.along_x[c][pixels.clone()]);
+                put(along_y, &mut linear.along_y[c][pixels.clone()]);
             }
         }
     }
+}
+
+/// At most [`LANES`] numbers; the other lanes are 0.
+#[inline(always)]
+fn some<S: Simd>(from: &[f32]) -> S {
+    if let Some(all) = from.first_chunk() {
+        return S::load(all);
+    }
+    let mut lanes = [0.0; LANES];
+    lanes[..from.len()].copy_from_slice(from);
+    S::load(&lanes)
+}
+
+/// Writes what [`some`] reads.
+#[inline(always)]
+fn put<S: Simd>(numbers: S, to: &mut [f32]) {
+    if let Some(all) = to.first_chunk_mut() {
+        numbers.store(all);
+        return;
+    }
+    let mut lanes = [0.0; LANES];
+    numbers.store(&mut lanes);
+    to.copy_from_slice(&lanes[..to.len()]);
 }
 
 /// Per pixel two linear equations, coupled with the four neighbours:
@@ -242,7 +272,9 @@ fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, eq
         y[i] += xy[i] * u[i] + yy[i] * v[i] + HOLD * v[i];
         let total = left[i] + up[i] + right[i] + down[i] + HOLD;
         let (a, b, c) = (xx[i] + total, xy[i], yy[i] + total);
-        let inverse = 1.0 / (a * c - b * b);
+        // What the determinant is at least, however the products round.
+        let least = total * (xx[i] + yy[i] + total);
+        let inverse = 1.0 / (a * c - b * b).max(least);
         xx[i] = c * inverse;
         xy[i] = -b * inverse;
         yy[i] = a * inverse;
@@ -260,19 +292,34 @@ fn relax_kernel<S: Simd>(equations: &Equations, sweeps: u32, flow: &mut Flow) {
     let (width, height) = (flow.width, flow.height);
     // A row before and after, so that every neighbour exists; its links are 0.
     let spare = vec![0.0; width];
-    let mut current = [[&spare[..], &flow.u, &spare].concat(), [&spare[..], &flow.v, &spare].concat()];
-    let mut next = current.clone();
-    let mut momentum = 1.0;
-    for sweep in 0..sweeps {
-        for y in 0..height {
-            sweep_row(equations, y, momentum, &current, &mut next);
+    let start = [[&spare[..], &flow.u, &spare].concat(), [&spare[..], &flow.v, &spare].concat()];
+    let mut sides = [start.clone(), start];
+    let sweeps = momenta(sweeps);
+    // Each sweep follows the one before at a distance of one row: what a row needs is still in the cache.
+    for front in 0..height + sweeps.len() {
+        for (sweep, &momentum) in sweeps.iter().enumerate() {
+            let Some(y) = front.checked_sub(sweep).filter(|&y| y < height) else { continue };
+            let [even, odd] = &mut sides;
+            let (current, next) = if sweep % 2 == 0 { (&*even, odd) } else { (&*odd, even) };
+            sweep_row(equations, y, momentum, current, next);
         }
-        let square = SPECTRAL_RADIUS * SPECTRAL_RADIUS;
-        momentum = 1.0 / (1.0 - if sweep == 0 { 0.5 * square } else { 0.25 * square * momentum });
-        std::mem::swap(&mut current, &mut next);
     }
+    let current = &sides[sweeps.len() % 2];
     flow.u.copy_from_slice(&current[0][width..width * (height + 1)]);
     flow.v.copy_from_slice(&current[1][width..width * (height + 1)]);
+}
+
+/// Chebyshev's factor of every sweep.
+fn momenta(sweeps: u32) -> Vec<f32> {
+    let square = SPECTRAL_RADIUS * SPECTRAL_RADIUS;
+    let mut momentum = 1.0;
+    (0..sweeps)
+        .map(|sweep| {
+            let of_this = momentum;
+            momentum = 1.0 / (1.0 - if sweep == 0 { 0.5 * square } else { 0.25 * square * momentum });
+            of_this
+        })
+        .collect()
 }
 
 #[inline(always)]
@@ -309,21 +356,4 @@ fn sweep_row(
         next_u[i] += momentum * (solved_u - next_u[i]);
         next_v[i] += momentum * (solved_v - next_v[i]);
     }
-}
-
-/// The target, fetched along the flow, minus the reference.
-pub(super) fn residuals(reference: &Planes, target: &Planes, flow: &Flow) -> [Vec<f32>; 3] {
-    let (width, height) = (flow.width, flow.height);
-    let mut residuals = [(); 3].map(|()| Vec::with_capacity(width * height));
-    for y in 0..height {
-        let here = [0, 1, 2].map(|channel| reference.row(channel, y));
-        for x in 0..width {
-            let [u, v] = flow.at(x, y);
-            let there = target.colour_at(x as f32 + u, y as f32 + v);
-            for channel in 0..3 {
-                residuals[channel].push(there[channel] - here[channel][x]);
-            }
-        }
-    }
-    residuals
 }

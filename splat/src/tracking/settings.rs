@@ -3,47 +3,70 @@
 use serde::{Deserialize, Serialize};
 
 use super::learned::OnnxSettings;
-use crate::settings::Quality;
+use crate::settings::{Quality, range};
 
 /// How dense tracks are found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackingSettings {
-    /// Images are halved until their longer side is at most this many pixels; 16 and up, default 800.
+    /// Images whose longer side has more pixels than this are matched at half their resolution or less; 16 to 65 536,
+    /// default 400, with `best` 1600. What moves by a pixel is found to a tenth of one, so little is lost.
+    #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
+    pub full_side: u32,
+    /// Images are halved until their longer side is at most this many pixels; 16 to 65 536, default 800, with `draft`
+    /// 400, with `best` 1600.
+    #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
     pub max_side: u32,
     /// Images of the exhaustive search are halved until their longer side is at most this many pixels; 16 to 256,
-    /// default 100. Its time grows with the fourth power; 80 in the draft preset.
+    /// default 100, with `draft` 80. Its time grows with the fourth power.
+    #[serde(deserialize_with = "range::whole::<16, 256, _>")]
     pub search_side: u32,
-    /// Largest displacement between two frames that the exhaustive search finds, as a fraction of the width; 0 to 1,
-    /// default 0.4.
+    /// Largest displacement between two frames along either axis that the exhaustive search finds, as a fraction of the
+    /// width; 0 to 1, default 0.4.
+    #[serde(deserialize_with = "range::unit")]
     pub search_radius: f32,
     /// Whether colour is matched instead of brightness alone: surer, and slower; default true. The exhaustive search
     /// always sees colour.
     pub colour: bool,
-    /// Distances in frames over which tracks are chained besides the direct match with the key frame; each at least
-    /// 1, default 1 and 2.
+    /// Distances in frames over which tracks are chained besides the direct match with the key frame; up to 16 of 1 to
+    /// 1000, default 1 and 2, with `draft` 1, with `best` 1, 2, 4 and 8.
+    #[serde(deserialize_with = "range::gaps")]
     pub gaps: Vec<u32>,
-    /// Levels whose longer side has more pixels than this are refined without matching patches; default 400.
+    /// Levels whose longer side has more pixels than this are refined without matching patches; 0 to 65 536, default
+    /// 400, with `draft` 200, with `best` 1600.
+    #[serde(deserialize_with = "range::whole::<0, 65_536, _>")]
     pub patch_side: u32,
-    /// Distance of neighbouring patches, pixels; 1 to 8, default 3.
+    /// Distance of neighbouring patches at the full resolution of the pyramid, pixels; half of it, rounded up, at all
+    /// others; 1 to 8, default 3, with `draft` 4, with `best` 2.
+    #[serde(deserialize_with = "range::whole::<1, 8, _>")]
     pub patch_stride: u32,
-    /// Descent steps per patch and level; 1 and up, default 12.
+    /// Descent steps per patch and level; 1 to 1000, default 8, with `best` 16.
+    #[serde(deserialize_with = "range::whole::<1, 1000, _>")]
     pub patch_iterations: u32,
-    /// Weight of smoothness against colour constancy; 0 and up, default 100.
+    /// Weight of smoothness against colour constancy; 0 to a million, default 100.
+    #[serde(deserialize_with = "range::weight")]
     pub smoothness: f32,
-    /// Linearisations of the variational refinement per level; 0 (off) and up, default 2.
+    /// Linearisations of the variational refinement per level; 0 (off) to 100, default 2, with `draft` 1, with `best` 3.
+    #[serde(deserialize_with = "range::whole::<0, 100, _>")]
     pub smoothing_warps: u32,
-    /// Half side of the windows that share one displacement in the refinement, pixels; 0 to 10, default 3.
+    /// Half side of the windows that share one displacement in the refinement, pixels; 0 to 10, default 3. Up to 4 are
+    /// fast.
+    #[serde(deserialize_with = "range::whole::<0, 10, _>")]
     pub smoothing_window: u32,
-    /// Sweeps of the variational refinement per linearisation; 0 (off) and up, default 10.
+    /// Sweeps of the variational refinement per linearisation; 0 (off) to 1000, default 10.
+    #[serde(deserialize_with = "range::whole::<0, 1000, _>")]
     pub smoothing_iterations: u32,
     /// Forward-backward error above which a pixel is called hidden, pixels; above 0, default 1.5.
+    #[serde(deserialize_with = "range::distance")]
     pub consistency: f32,
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
+    #[serde(deserialize_with = "range::correlation")]
     pub correlation: f32,
     /// Standard deviation that no track goes below, pixels; above 0, default 0.028.
+    #[serde(deserialize_with = "range::distance")]
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
+    #[serde(deserialize_with = "range::distance")]
     pub hidden_sigma: f32,
     /// How images reach a learned tracker; without effect on the built-in one.
     pub onnx: OnnxSettings,
@@ -59,6 +82,7 @@ impl TrackingSettings {
     /// The settings of a quality level.
     pub fn preset(quality: Quality) -> Self {
         let balanced = Self {
+            full_side: 400,
             max_side: 800,
             search_side: 100,
             search_radius: 0.4,
@@ -66,7 +90,7 @@ impl TrackingSettings {
             gaps: vec![1, 2],
             patch_side: 400,
             patch_stride: 3,
-            patch_iterations: 12,
+            patch_iterations: 8,
             smoothness: 100.0,
             smoothing_warps: 2,
             smoothing_window: 3,
@@ -84,12 +108,12 @@ impl TrackingSettings {
                 gaps: vec![1],
                 patch_side: 200,
                 patch_stride: 4,
-                patch_iterations: 8,
                 smoothing_warps: 1,
                 ..balanced
             },
             Quality::Balanced => balanced,
             Quality::Best => Self {
+                full_side: 1600,
                 max_side: 1600,
                 gaps: vec![1, 2, 4, 8],
                 patch_side: 1600,

@@ -132,6 +132,9 @@ fn subpixel_shifts_are_followed_with_honest_sigma() {
         assert!(quantile(seen.iter().map(|&i| errors[i]).collect(), 0.95) < 0.25);
         let honest = fraction(seen.iter().map(|&i| errors[i] < 3.0 * field.sigma[i]));
         assert!(honest > 0.97, "{honest}");
+        // A Gaussian has 39 % of its errors in the plane within one standard deviation per axis.
+        let modest = fraction(seen.iter().map(|&i| errors[i] < field.sigma[i]));
+        assert!((0.1..0.8).contains(&modest), "{modest}");
     }
 }
 
@@ -233,18 +236,14 @@ fn dishonest(field: &TrackField, truth: impl Fn([f32; 2]) -> [f32; 2]) -> f64 {
 }
 
 #[test]
-fn half_a_turn_is_not_followed_and_this_is_admitted() {
+fn what_half_a_turn_makes_of_a_frame_is_not_claimed_to_be_known() {
     let texture = Texture::new(12, 6.0);
     let key = render(80, 64, |x, y| texture.at(x, y));
     let turned = render(80, 64, |x, y| texture.at(80.0 - x, 64.0 - y));
     let field = track(&[key, turned], &balanced()).remove(0);
-    // Patches are not turned: next to nothing is found, and three pixels in a hundred match elsewhere by chance.
-    let followed = errors(&field, |at| [80.0 - at[0], 64.0 - at[1]])
-        .iter()
-        .map(|&error| error < 2.0)
-        .collect::<Vec<_>>();
-    assert!(fraction(followed.into_iter()) < 0.1);
-    assert!(fraction(field.visible.iter().copied()) < 0.08);
+    // Patches are not turned: what is called visible, a pixel in eighteen, matches elsewhere by chance.
+    let wrong = dishonest(&field, |at| [80.0 - at[0], 64.0 - at[1]]);
+    assert!(wrong < 0.08, "{wrong}");
 }
 
 #[test]
@@ -259,10 +258,10 @@ fn a_stop_more_or_less_is_not_motion() {
         let truth = |at: [f32; 2]| [at[0] + 2.0, at[1] - 1.0];
         assert!(dishonest(&field, truth) < 0.02, "gain {gain}");
         let errors = errors(&field, truth);
-        let followed = (0..errors.len()).map(|i| field.visible[i] && errors[i] < 1.0);
-        // Windows are compared up to an offset, not up to a gain: twice the light costs most of the tracks, not their
-        // honesty.
-        assert!(fraction(followed) > if gain < 1.0 { 0.4 } else { 0.2 }, "gain {gain}");
+        let followed = (0..errors.len()).map(|i| field.visible[i] && errors[i] < 0.5);
+        // As without the change: what the border hides is missing.
+        let followed = fraction(followed);
+        assert!(followed > 0.85, "gain {gain}: {followed}");
     }
 }
 
@@ -365,10 +364,28 @@ fn tiny_images_and_broken_values_give_finite_tracks() {
 fn extreme_settings_give_finite_tracks() {
     let texture = Texture::new(9, 5.0);
     let frames = [0.0, 2.0, 4.0].map(|shift| render(64, 48, |x, y| texture.at(x - shift, y)));
-    let all_zero = r#"{"max_side":0,"search_side":0,"search_radius":0,"colour":false,"gaps":[0],"patch_side":0,"patch_stride":0,
-        "patch_iterations":0,"smoothness":0,"smoothing_warps":0,"smoothing_window":0,"smoothing_iterations":0,
-        "consistency":0,"correlation":0,"sigma_floor":0.01,"hidden_sigma":0}"#;
-    track(&frames, &serde_json::from_str(all_zero).unwrap());
+    // No file may say these, but a caller may.
+    let all_zero = TrackingSettings {
+        full_side: 0,
+        max_side: 0,
+        search_side: 0,
+        search_radius: 0.0,
+        colour: false,
+        gaps: vec![0],
+        patch_side: 0,
+        patch_stride: 0,
+        patch_iterations: 0,
+        smoothness: 0.0,
+        smoothing_warps: 0,
+        smoothing_window: 0,
+        smoothing_iterations: 0,
+        consistency: 0.0,
+        correlation: 0.0,
+        sigma_floor: 0.01,
+        hidden_sigma: 0.0,
+        onnx: Default::default(),
+    };
+    track(&frames, &all_zero);
     let huge =
         TrackingSettings { search_radius: 1e9, smoothness: 1e30, smoothing_window: 1000, ..balanced() };
     track(&frames, &huge);
@@ -434,6 +451,21 @@ fn settings_survive_a_round_trip_and_refuse_unknown_keys() {
         let text = serde_json::to_string(&settings).unwrap();
         assert_eq!(serde_json::from_str::<TrackingSettings>(&text).unwrap(), settings);
     }
-    let error = serde_json::from_str::<TrackingSettings>(r#"{"smothness": 3}"#).unwrap_err();
-    assert!(error.to_string().contains("smothness"));
+    for (wrong, said) in [
+        (r#"{"smothness": 3}"#, "smothness"),
+        (r#"{"smoothness": -1}"#, "between 0 and"),
+        (r#"{"smoothness": 1e18}"#, "between 0 and"),
+        (r#"{"patch_stride": 0}"#, "between 1 and 8"),
+        (r#"{"patch_stride": 9}"#, "between 1 and 8"),
+        (r#"{"search_side": 1600}"#, "between 16 and 256"),
+        (r#"{"max_side": 2}"#, "between 16 and 65536"),
+        (r#"{"smoothing_iterations": 4294967295}"#, "between 0 and 1000"),
+        (r#"{"correlation": 2}"#, "between -1 and 1"),
+        (r#"{"consistency": 0}"#, "above 0"),
+        (r#"{"sigma_floor": 0}"#, "above 0"),
+        (r#"{"gaps": [1, 0]}"#, "between 1 and 1000"),
+    ] {
+        let error = serde_json::from_str::<TrackingSettings>(wrong).unwrap_err().to_string();
+        assert!(error.contains(said), "{wrong}: {error}");
+    }
 }

@@ -1,64 +1,89 @@
 //! Values and gradients side by side, for sampling along a flow.
 
 use super::planes::Planes;
+use crate::simd::{LANES, ROWS, Simd};
 
 /// Replicated pixels on every side: one to interpolate with, one more for positions a pixel outside.
 const BORDER: usize = 2;
 
-/// Per pixel and channel the value and its central differences along x and y, padded to four numbers: the corners of
-/// an interpolation are four loads.
+/// A pixel of a channel: value, central differences along x and y, nothing.
+type Texel = [f32; ROWS];
+
+/// What a channel shows at [`LANES`] places: values, and gradients along x and y.
+pub(super) type Sample<S> = [S; 3];
+
+/// Texels of every channel: the corners of an interpolation are four loads.
 pub(super) struct Texels<const CHANNELS: usize> {
     width: usize,
     height: usize,
     stride: usize,
-    texels: Vec<[[f32; 4]; CHANNELS]>,
+    channels: [Vec<Texel>; CHANNELS],
 }
 
 impl<const CHANNELS: usize> Texels<CHANNELS> {
     pub(super) fn new(planes: &Planes<CHANNELS>) -> Self {
         let (width, height) = (planes.width, planes.height);
         let stride = width + 2 * BORDER;
-        let mut texels = Vec::with_capacity(stride * (height + 2 * BORDER));
-        for y in 0..height + 2 * BORDER {
-            let y = y.saturating_sub(BORDER).min(height - 1);
-            let first = texels.len() + BORDER;
-            texels.resize(first, [[0.0; 4]; CHANNELS]);
-            for x in 0..width {
-                let mut texel = [[0.0; 4]; CHANNELS];
-                for (texel, channel) in texel.iter_mut().zip(&planes.channels) {
-                    let at = planes.index(x, y);
-                    let along_x = 0.5 * (channel[at + 1] - channel[at - 1]);
-                    let along_y = 0.5 * (channel[at + planes.stride] - channel[at - planes.stride]);
-                    *texel = [channel[at], along_x, along_y, 0.0];
-                }
-                texels.push(texel);
+        let channels = planes.channels.each_ref().map(|channel| {
+            let mut texels = Vec::with_capacity(stride * (height + 2 * BORDER));
+            for y in 0..height + 2 * BORDER {
+                let at = planes.index(0, y.saturating_sub(BORDER).min(height - 1));
+                let row = |from: usize| &channel[from..from + width];
+                let (centre, left, right) = (row(at), row(at - 1), row(at + 1));
+                let (above, below) = (row(at - planes.stride), row(at + planes.stride));
+                let texel =
+                    |x: usize| [centre[x], 0.5 * (right[x] - left[x]), 0.5 * (below[x] - above[x]), 0.0];
+                texels.extend([texel(0); BORDER]);
+                texels.extend((0..width).map(texel));
+                texels.extend([texel(width - 1); BORDER]);
             }
-            let (left, right) = (texels[first], texels[first + width - 1]);
-            texels[first - BORDER..first].fill(left);
-            texels.extend([right; BORDER]);
-        }
-        Self { width, height, stride, texels }
+            texels
+        });
+        Self { width, height, stride, channels }
     }
 
-    /// Value and gradient of each channel at fractional pixel index `(x, y)`, bilinear; outside is the border.
+    /// Every channel at fractional pixel indices `(x, y)`, bilinear; outside is the border.
     #[inline(always)]
-    pub(super) fn sample(&self, x: f32, y: f32) -> [[f32; 4]; CHANNELS] {
-        // Shifting by the border makes the coordinates positive, so truncation is the floor.
-        let x = x.clamp(-1.0, self.width as f32) + BORDER as f32;
-        let y = y.clamp(-1.0, self.height as f32) + BORDER as f32;
-        let (column, row) = (x as usize, y as usize);
-        let (fx, fy) = (x - column as f32, y - row as f32);
-        let first = row * self.stride + column;
-        let upper = &self.texels[first..first + 2];
-        let lower = &self.texels[first + self.stride..first + self.stride + 2];
-        let mut sample = [[0.0; 4]; CHANNELS];
-        for c in 0..CHANNELS {
-            for k in 0..4 {
-                let above = upper[0][c][k] + fx * (upper[1][c][k] - upper[0][c][k]);
-                let below = lower[0][c][k] + fx * (lower[1][c][k] - lower[0][c][k]);
-                sample[c][k] = above + fy * (below - above);
+    pub(super) fn sample<S: Simd>(&self, x: S, y: S) -> [Sample<S>; CHANNELS] {
+        let (column, right) = split(x, self.width);
+        let (row, below) = split(y, self.height);
+        let first: [usize; LANES] =
+            std::array::from_fn(|lane| row[lane] as usize * self.stride + column[lane] as usize);
+        let shares = spread(right).into_iter().zip(spread(below));
+        let mut samples = [[S::splat(0.0); 3]; CHANNELS];
+        let mut groups = [[S::splat(0.0); ROWS]; CHANNELS];
+        for (part, (right, below)) in shares.enumerate() {
+            // Every fourth place, so that the transposition leaves them in their order.
+            let places = [first[part], first[part + 4], first[part + 8], first[part + 12]];
+            for (groups, texels) in groups.iter_mut().zip(&self.channels) {
+                let corner = |offset: usize| S::load_rows(places.map(|place| &texels[place + offset]));
+                let between = |left: S, other: S| other.sub(left).mul_add(right, left);
+                let upper = between(corner(0), corner(1));
+                let lower = between(corner(self.stride), corner(self.stride + 1));
+                groups[part] = lower.sub(upper).mul_add(below, upper);
             }
         }
-        sample
+        for (sample, groups) in samples.iter_mut().zip(groups) {
+            let [value, along_x, along_y, _] = S::transpose_rows(groups);
+            *sample = [value, along_x, along_y];
+        }
+        samples
     }
+}
+
+/// The texels before fractional pixel indices along an axis, and the fractions of the next.
+#[inline(always)]
+fn split<S: Simd>(at: S, size: usize) -> ([i32; LANES], S) {
+    // Not a number becomes the first pixel.
+    let inside = at.max(S::splat(-1.0)).min(S::splat(size as f32));
+    let whole = inside.floor();
+    let mut texels = [0; LANES];
+    whole.add(S::splat(BORDER as f32)).store_integers(&mut texels);
+    (texels, inside.sub(whole))
+}
+
+/// Of every row one number in all of its lanes: the first of each, the second, and so on.
+#[inline(always)]
+fn spread<S: Simd>(of: S) -> [S; ROWS] {
+    [of.spread_in_rows::<0>(), of.spread_in_rows::<1>(), of.spread_in_rows::<2>(), of.spread_in_rows::<3>()]
 }

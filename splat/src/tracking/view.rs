@@ -5,8 +5,9 @@ use std::{collections::VecDeque, convert::Infallible, sync::Arc};
 use super::{
     TrackField, TrackingSettings, chain,
     consistency::{self, Judged},
+    exposure::Exposure,
     fill,
-    flow::Flow,
+    flow::{self, Flow},
     matcher::{PairMatcher, PatchSearch, Ways},
     pair::{Frame, Guides},
 };
@@ -16,7 +17,6 @@ use crate::image::Image;
 struct Past {
     index: usize,
     frame: Frame,
-    texture: Vec<f32>,
     tracks: Judged,
 }
 
@@ -107,39 +107,36 @@ pub(super) struct Tracker<'a, M> {
     width: u32,
     height: u32,
     key: Frame,
-    key_texture: Vec<f32>,
+    exposure: Exposure,
     past: VecDeque<Past>,
 }
 
 impl<'a, M: PairMatcher> Tracker<'a, M> {
     pub(super) fn new(key: &Image, settings: &'a TrackingSettings, matcher: &'a M) -> Self {
-        let frame = Frame::new(key, settings);
-        let key_texture = consistency::texture(&frame);
         Self {
             settings,
             matcher,
             width: key.width,
             height: key.height,
-            key: frame,
-            key_texture,
+            key: Frame::new(key, settings),
+            exposure: Exposure::of(key),
             past: VecDeque::new(),
         }
     }
 
     pub(super) fn track(&mut self, index: usize, image: &Image) -> Result<TrackField, M::Error> {
-        let frame = Frame::new(image, self.settings);
+        let frame = Frame::new(&self.exposure.equalised(image), self.settings);
         let chains = self.chains(index, &frame)?;
         let guess = (!chains.is_empty()).then(|| chain::choose(&chains));
         let direct = self.direct(&frame, guess.as_ref())?;
         // The direct match comes first: of equals, the one that cannot have drifted.
         let candidates: Vec<Judged> = std::iter::once(direct).chain(chains).collect();
         let mut tracks = chain::choose(&candidates);
-        fill::fill_hidden(&mut tracks, &self.key.levels[0].interiors());
+        fill::fill_hidden(&mut tracks, &self.key.colours.interiors());
         let tracks = self.anchored(&frame, tracks);
         let field = self.field(&tracks);
 
-        let texture = consistency::texture(&frame);
-        self.past.push_back(Past { index, frame, texture, tracks });
+        self.past.push_back(Past { index, frame, tracks });
         let longest = self.settings.gaps.iter().copied().max().unwrap_or(0) as usize;
         while self.past.front().is_some_and(|past| past.index + longest <= index) {
             self.past.pop_front();
@@ -162,8 +159,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         let continue_from = |past: &Past| {
             let Ways { forward, backward } =
                 self.matcher.both_ways(&past.frame, frame, None, self.settings)?;
-            let onward =
-                consistency::judge(&past.frame, frame, forward, &backward, &past.texture, self.settings);
+            let onward = consistency::judge(&past.frame, frame, forward, &backward, self.settings);
             let mut chained = chain::chain(&past.tracks, &onward);
             consistency::recheck(&self.key, frame, &mut chained, self.settings);
             Ok(chained)
@@ -179,7 +175,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
             _ => None,
         };
         let Ways { forward, backward } = self.matcher.both_ways(&self.key, frame, guides, self.settings)?;
-        Ok(consistency::judge(&self.key, frame, forward, &backward, &self.key_texture, self.settings))
+        Ok(consistency::judge(&self.key, frame, forward, &backward, self.settings))
     }
 
     /// The tracks, refined once more against the key frame itself.
@@ -206,9 +202,9 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         for y in 0..height {
             for x in 0..width {
                 let (fx, fy) = ((x as f32 + 0.5) / scale - 0.5, (y as f32 + 0.5) / scale - 0.5);
-                let [u, v] = flow.sample(fx, fy);
                 let corners = flow.corners(fx, fy);
-                let visible = corners.iter().all(|&(corner, weight)| weight < 0.05 || tracks.visible[corner]);
+                let [u, v] = flow.between(&corners);
+                let visible = flow::sees(&corners, &tracks.visible);
                 let stated = |corner| tracks.stated_sigma(corner, self.settings.sigma_floor);
                 let sigma: f32 = corners.iter().map(|&(corner, weight)| weight * stated(corner)).sum();
                 let position = [x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale];

@@ -26,7 +26,7 @@ impl PairMatcher for LearnedTracker {
         _settings: &TrackingSettings,
     ) -> Result<Ways, LearnedError> {
         let [first, second] = [first, second]
-            .map(|frame| self.network.input(frame.width(), frame.height(), &frame.levels[0].interiors()));
+            .map(|frame| self.network.input(frame.width(), frame.height(), &frame.colours.interiors()));
         let (first, second) = (first?, second?);
         let (forward, backward) = rayon::join(|| self.flow(&first, &second), || self.flow(&second, &first));
         Ok(Ways { forward: forward?, backward: backward? })
@@ -42,9 +42,10 @@ impl LearnedTracker {
     /// The settings of the chains around the network: images are halved only as far as leaves it the resolution that it
     /// takes.
     pub(super) fn chained(&self, settings: &TrackingSettings) -> TrackingSettings {
-        // Halving an image of twice the side or more leaves the side; `max_side` is the largest that is not halved.
+        // Halving an image of twice the side or more leaves the side; `seen` is the largest that is not halved.
         let seen = 2 * self.network.longest_side() as u32 - 1;
-        TrackingSettings { max_side: settings.max_side.max(seen), ..settings.clone() }
+        let [max_side, full_side] = [settings.max_side, settings.full_side].map(|side| side.max(seen));
+        TrackingSettings { max_side, full_side, ..settings.clone() }
     }
 
     fn flow(&self, first: &Input, second: &Input) -> Result<Flow, LearnedError> {
