@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use futures::{StreamExt, stream::FuturesUnordered};
+use futures::future::try_join_all;
 use splat::{
     formats::track_blob,
     image::Image,
@@ -41,24 +41,18 @@ impl Job {
     async fn track_while_alone(&self) -> Result<(), StageError> {
         // One for all views: a network may be large.
         let tracker = OnceCell::new();
-        let mut running = FuturesUnordered::new();
-        let mut changed = self.changed.clone();
-        loop {
-            changed.borrow_and_update();
-            while running.len() < self.hub.options.compute_threads
-                && let Some((lease, request)) = self.hub.lease_own(&self.id, &self.stop).await?
-            {
-                running.push(self.track_view(lease, request, &tracker));
-            }
-            if running.is_empty() {
-                return Ok(());
-            }
-            tokio::select! {
-                Some(ended) = running.next() => ended?,
-                // More views may be there for the threads that have none.
-                woken = changed.changed() => woken.map_err(|_| StageError::Stopped)?,
-            }
+        // Lanes are polled together: one that rests while it holds the desk would keep the others from it for ever.
+        let lanes = (0..self.hub.options.compute_threads.max(1)).map(|_| self.track_in_turn(&tracker));
+        try_join_all(lanes).await?;
+        Ok(())
+    }
+
+    /// Tracks one view after the other until there is none for the coordinator.
+    async fn track_in_turn(&self, tracker: &OnceCell<Arc<Tracker>>) -> Result<(), StageError> {
+        while let Some((lease, request)) = self.hub.lease_own(&self.id, &self.stop).await? {
+            self.track_view(lease, request, tracker).await?;
         }
+        Ok(())
     }
 
     async fn track_view(
@@ -116,11 +110,10 @@ struct OwnTracking {
 impl OwnTracking {
     fn run(&self) -> Result<(), StageError> {
         let frames = &self.request.frames;
-        let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
         let mut load = |index: usize| self.load(index);
         let mut emit = |index: usize, field: TrackField| self.emit(index, &field);
         let is_missing = |index: usize| frames[index].tracks.is_none();
-        self.tracker.track_missing(last + 1, &is_missing, &mut load, &self.settings.tracking, &mut emit)
+        self.tracker.track_missing(frames.len(), &is_missing, &mut load, &self.settings.tracking, &mut emit)
     }
 
     fn load(&self, index: usize) -> Result<Arc<Image>, StageError> {

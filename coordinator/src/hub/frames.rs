@@ -210,3 +210,11 @@ impl Desk {
         Some((active.base.clone()?, active.stop.clone()))
     }
 }
+
+#[cfg(test)]
+impl Hub {
+    /// As if something had happened to the tasks of a job.
+    pub(crate) async fn stir(&self, job: &JobId) {
+        self.desk.lock().await.changed(job);
+    }
+}

@@ -184,3 +184,24 @@ async fn an_orderly_end_of_the_coordinator_counts_as_no_failure() {
     let record = bench.hub().store.task(&lease.key).await.unwrap().unwrap();
     assert_eq!((record.failures, record.attempts, record.state().unwrap().label()), (0, 1, "ready"));
 }
+
+#[tokio::test]
+async fn views_that_end_while_others_begin_do_not_wait_for_each_other_for_ever() {
+    let bench = Bench::start_with(|options| options.compute_threads = 3).await;
+    for shade in 0..8 {
+        write_clip(&bench.folder.path().join("clip"), shade);
+        let mut request = tracked_request(&bench);
+        request.output = bench.folder.path().join(format!("out{shade}")).display().to_string();
+        let job = bench.submit(request).await.unwrap().job_id;
+        let (hub, stirred) = (bench.hub(), job.as_str().into());
+        let stirring = tokio::spawn(async move {
+            loop {
+                hub.stir(&stirred).await;
+                tokio::task::yield_now().await;
+            }
+        });
+        let is_over = |event: &Event| matches!(event, Event::JobState(j) if j.state() == JobState::Frames);
+        bench.watch(&job, 0).await.until(is_over).await;
+        stirring.abort();
+    }
+}

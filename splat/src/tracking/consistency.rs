@@ -50,11 +50,11 @@ const COLOUR_TOLERANCE: f32 = 24.0;
 // and the 95 % quantile of the errors on two clips; docs/tracking.md has the procedure and the result by decile.
 
 /// Share of a match's squared forward-backward error.
-const TRIP: f32 = 0.2;
+const TRIP: f32 = 0.177;
 /// Share of the variance by image noise: neighbouring residuals are not independent, yet most noise averages out.
-const NOISE_SHARE: f32 = 0.038;
+const NOISE_SHARE: f32 = 0.0336;
 /// Share of the squared distance that the alignment moves a track.
-const ALIGNMENT: f32 = 1.8;
+const ALIGNMENT: f32 = 1.59;
 
 /// Agreement of the surroundings of each pixel with where a flow puts them.
 pub(super) struct Agreement {

@@ -8,7 +8,7 @@ use crate::simd::{Instructions, LANES, Simd, simd_kernel};
 const RESIDUAL_SCALE: f32 = 4.0;
 /// Flow difference between neighbours at which the smoothness turns from quadratic to linear, pixels: small where
 /// nothing moves, as what rests does so alike, and growing with the motion, as what moves turns and bends.
-const DIFFERENCE_AT_REST: f32 = 0.03;
+const DIFFERENCE_AT_REST: f32 = 0.003;
 const DIFFERENCE_BY_MOTION: f32 = 0.1;
 const DIFFERENCE_AT_MOST: f32 = 0.3;
 /// Weight of staying: keeps pixels without neighbour or texture where they are.
@@ -254,10 +254,13 @@ fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, eq
         for i in 0..count {
             let (du, dv) = (u[i] - other_u[i], v[i] - other_v[i]);
             let speed = u[i] * u[i] + v[i] * v[i];
+            let other = other_u[i] * other_u[i] + other_v[i] * other_v[i];
+            let speed = if speed > other { speed } else { other };
             let scale =
                 DIFFERENCE_AT_REST * DIFFERENCE_AT_REST + DIFFERENCE_BY_MOTION * DIFFERENCE_BY_MOTION * speed;
             let scale = scale.min(DIFFERENCE_AT_MOST * DIFFERENCE_AT_MOST);
-            links[i] = weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
+            let rest = 1.0 + 10.0 / (1.0 + 100.0 * speed);
+            links[i] = rest * weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
         }
     }
     let equations = &mut *equations;
