@@ -5,6 +5,7 @@ use super::{
     flow::Flow,
     pair::Frame,
     planes::{PATCH, Planes},
+    refine::rest,
     windows::{box_counts, box_sum},
 };
 
@@ -43,16 +44,19 @@ const NOISE: f32 = 6.0;
 const COLOUR_TOLERANCE: f32 = 24.0;
 
 // The variance of a track per axis is modelled as
-//     floor² + TRIP Σe² + NOISE_SHARE Σn/λ + DOUBT² d² + ALIGNMENT L a²,
+//     floor² + Σ r (TRIP e² + NOISE_SHARE n/λ) + DOUBT² d² + r ALIGNMENT L a²,
 // with sums over the matches of its chain: e is the forward-backward error, n the mean squared residual of the window,
 // λ the smaller eigenvalue of the structure tensor; d is the distance to a candidate that disagrees (`chain`), a how far
-// the alignment with the key frame moves the track, L the number of matches. Fitted by quantile regression of the 68 %
-// and the 95 % quantile of the errors on two clips; docs/tracking.md has the procedure and the result by decile.
+// the alignment with the key frame moves the track, L the number of matches; r < 1 where the flow is smooth as it rests.
+// Fitted by quantile regression of the 68 % and the 95 % quantile of the errors on two clips; docs/tracking.md has the
+// procedure and the result by decile.
 
 /// Share of a match's squared forward-backward error.
 const TRIP: f32 = 0.177;
 /// Share of the variance by image noise: neighbouring residuals are not independent, yet most noise averages out.
 const NOISE_SHARE: f32 = 0.0336;
+/// Power of the smoothness by which the variance of what rests is divided: neighbours share their noise.
+const REST_POWER: f32 = 0.65;
 /// Share of the squared distance that the alignment moves a track.
 const ALIGNMENT: f32 = 1.59;
 
@@ -170,7 +174,9 @@ pub(super) fn judge(
             visible
                 .push(inside && error[i] < settings.consistency && agreement.holds(i, settings.correlation));
             let noise = agreement.residual[i].max(4.0);
-            let variance = TRIP * error[i] * error[i] + NOISE_SHARE * noise / (first.texture[i] + 1e-3);
+            let squared_error = error[i] * error[i];
+            let variance = TRIP * squared_error + NOISE_SHARE * noise / (first.texture[i] + 1e-3);
+            let variance = variance * share_at_rest((u * u + v * v).max(squared_error));
             sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
         }
     }
@@ -190,12 +196,18 @@ pub(super) fn recheck(first: &Frame, second: &Frame, judged: &mut Judged, settin
     }
 }
 
+/// Share of the variance that is left where the square of a displacement, or of the doubt about it, is this.
+fn share_at_rest(squared: f32) -> f32 {
+    rest(squared).powf(-REST_POWER)
+}
+
 /// Accounts for the alignment of tracks with the key frame: where it moves them far, one of both is wrong, and a long
 /// chain has more to put right.
 pub(super) fn account_for_alignment(aligned: &mut Judged, before: &Flow) {
     for i in 0..aligned.alignment.len() {
         let moved = [aligned.flow.u[i] - before.u[i], aligned.flow.v[i] - before.v[i]];
         let squared = moved[0] * moved[0] + moved[1] * moved[1];
-        aligned.alignment[i] = ALIGNMENT * aligned.links[i] * squared;
+        let speed = aligned.flow.u[i] * aligned.flow.u[i] + aligned.flow.v[i] * aligned.flow.v[i];
+        aligned.alignment[i] = ALIGNMENT * aligned.links[i] * squared * share_at_rest(speed.max(squared));
     }
 }

@@ -18,6 +18,17 @@ const SPECTRAL_RADIUS: f32 = 0.95;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
 const SHADING_RADIUS: usize = 4;
 
+/// How many times as smooth what rests is, and the displacement at which that is halved, pixels: cameras stand still, so
+/// most of what they see moves by nothing but noise.
+const REST: f32 = 30.0;
+const REST_SPEED: f32 = 0.05;
+
+/// How many times as smooth the flow is where its square is this.
+#[inline(always)]
+pub(super) fn rest(squared_speed: f32) -> f32 {
+    1.0 + REST / (1.0 + squared_speed * (1.0 / (REST_SPEED * REST_SPEED)))
+}
+
 /// How strongly and how long to smooth.
 #[derive(Clone, Copy)]
 pub(super) struct Smoothing {
@@ -253,14 +264,13 @@ fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, eq
         let (other_u, other_v) = (&flow.u[..count], &flow.v[..count]);
         for i in 0..count {
             let (du, dv) = (u[i] - other_u[i], v[i] - other_v[i]);
-            let speed = u[i] * u[i] + v[i] * v[i];
-            let other = other_u[i] * other_u[i] + other_v[i] * other_v[i];
-            let speed = if speed > other { speed } else { other };
+            let (here, there) =
+                (u[i] * u[i] + v[i] * v[i], other_u[i] * other_u[i] + other_v[i] * other_v[i]);
+            let speed = if here > there { here } else { there };
             let scale =
                 DIFFERENCE_AT_REST * DIFFERENCE_AT_REST + DIFFERENCE_BY_MOTION * DIFFERENCE_BY_MOTION * speed;
             let scale = scale.min(DIFFERENCE_AT_MOST * DIFFERENCE_AT_MOST);
-            let rest = 1.0 + 10.0 / (1.0 + 100.0 * speed);
-            links[i] = rest * weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
+            links[i] = rest(speed) * weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
         }
     }
     let equations = &mut *equations;
