@@ -1,14 +1,11 @@
 //! What `track` and `eval-tracks` share: which views and frames of a clip, and how they are tracked.
 
-use std::{
-    fs::File,
-    io::Read,
-    path::{Path, PathBuf},
-};
+use std::{fs::File, io::Read, path::PathBuf};
 
 use clap::Args;
 use splat::{
     clip::{Clip, ClipOptions, Split},
+    formats::track_npz::files_by_view,
     tracking::{
         TrackField, Tracker, TrackingSettings,
         learned::{LearnedError, MAX_MODEL_BYTES},
@@ -160,25 +157,12 @@ impl ChosenViews {
         ended.map_err(|Stop(error)| error)
     }
 
-    /// The file of each chosen view: by name where every file is named after a chosen view, else by order.
-    pub(crate) fn files<'a>(&self, files: &'a [PathBuf]) -> Result<Vec<&'a Path>, CliError> {
-        let names: Vec<&str> = self.positions.iter().map(|&position| self.name(position)).collect();
-        let stem = |file: &'a PathBuf| file.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
-        let by_name = files.iter().all(|file| names.contains(&stem(file)));
-        let of_view = |(rank, name): (usize, &&str)| {
-            let found = if by_name { files.iter().find(|file| stem(file) == *name) } else { files.get(rank) };
-            found.map(PathBuf::as_path).ok_or_else(|| {
-                CliError::bad_input(
-                    "--tracks",
-                    format!(
-                        "no file for view '{name}' among {}; give one npz per view, in view order or named after the \
-                         views, or choose views with --views",
-                        files.len()
-                    ),
-                )
-            })
-        };
-        names.iter().enumerate().map(of_view).collect()
+    /// The file of each chosen view.
+    pub(crate) fn files<'a>(&self, files: &'a [PathBuf]) -> Result<Vec<&'a PathBuf>, CliError> {
+        let chosen: Vec<&str> = self.positions.iter().map(|&position| self.name(position)).collect();
+        let all: Vec<&str> = self.clip().views().iter().map(|view| view.name.as_str()).collect();
+        files_by_view(files, &chosen, &all)
+            .map_err(|error| CliError::bad_input("--tracks", format!("{error}; --views chooses views")))
     }
 }
 

@@ -94,7 +94,12 @@ fn wrong_input_names_what_is_wrong_and_the_remedy() {
     let line = ["track", clip, "--out", text(&file), "--set", "refine.iterations=3"];
     is_refused(&line, &["refine.iterations=3", "tracking."]);
     is_refused(&["eval-tracks", clip, "--views", "test00"], &["flow/test00.npz", "--views"]);
-    is_refused(&["eval-tracks", clip, "--tracks", text(&file)], &["cam01", "one npz per view"]);
+    is_refused(
+        &["eval-tracks", clip, "--tracks", text(&file)],
+        &["cam00, cam01", "one npz per view", "--views"],
+    );
+    let line = ["eval-tracks", clip, "--views", "cam01", "--tracks", "cam00.npz"];
+    is_refused(&line, &["cam00.npz", "'cam01'", "named after the views"]);
     is_refused(&["eval-tracks", clip, "--views", "cam00", "--tracks", text(&file)], &["one.npz"]);
     let (code, said) = program::run(["eval-tracks", clip, "--tracks", text(&file), "--quality", "best"]);
     assert_eq!(code, 2, "{said}");

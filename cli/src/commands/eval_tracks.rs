@@ -30,7 +30,7 @@ pub(crate) struct EvalTracksArgs {
     #[command(flatten)]
     views: ViewsArgs,
 
-    /// Tracks to measure, an npz per view, in view order or named after the views, in any convention of
+    /// Tracks to measure, an npz per view, named after the views or in their order, in any convention of
     /// docs/trackers.md [default: the tracker's].
     #[arg(long, value_name = "FILE", num_args = 1.., help_heading = "Input",
           conflicts_with_all = ["tracker", "quality", "settings", "set"])]

@@ -27,6 +27,7 @@ use zip::ZipArchive;
 use super::TrackError;
 use crate::tracking::TrackField;
 
+mod by_view;
 mod conventions;
 mod grid;
 mod imported;
@@ -35,6 +36,7 @@ mod points;
 mod tests;
 mod writer;
 
+pub use by_view::{Names, TrackFilesError, files_by_view};
 pub use conventions::open_tracks;
 pub use imported::ImportedTracks;
 pub use points::PointTracks;
