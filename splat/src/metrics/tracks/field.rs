@@ -78,7 +78,10 @@ impl FieldScores {
     /// shortest of the arrays.
     pub fn add(&mut self, tracks: &TrackField, exact: &TrackField, valid: &[bool], moving: &[bool]) {
         let diagonal = (exact.width as f32).hypot(exact.height as f32);
-        let pixels = tracks.positions.len().min(exact.positions.len()).min(valid.len()).min(moving.len());
+        let held = [&tracks.positions, &exact.positions].map(Vec::len);
+        let flags = [&tracks.visible[..], &exact.visible, valid, moving].map(<[bool]>::len);
+        let lengths = held.into_iter().chain(flags).chain([tracks.sigma.len()]);
+        let pixels = lengths.min().unwrap_or_default();
         for i in (0..pixels).filter(|&i| valid[i]) {
             let (at, truth) = (tracks.positions[i], exact.positions[i]);
             let off = [at[0] - truth[0], at[1] - truth[1]];

@@ -68,6 +68,42 @@ fn nothing_has_no_figures() {
 }
 
 #[test]
+fn nothing_is_counted_beyond_the_shortest_array() {
+    let whole = || row(&[1.0, 2.0, 3.0], &[true; 3], &[0.5; 3]);
+    let mut expected = FieldScores::default();
+    expected.add(&row(&[1.0], &[true], &[0.5]), &row(&[0.0], &[true], &[0.5]), &[true], &[false]);
+    let exact = || row(&[0.0; 3], &[true; 3], &[0.5; 3]);
+    for short in 0..7 {
+        let (mut tracks, mut truth, mut valid, mut moving) =
+            (whole(), exact(), vec![true; 3], vec![false; 3]);
+        match short {
+            0 => tracks.positions.truncate(1),
+            1 => tracks.visible.truncate(1),
+            2 => tracks.sigma.truncate(1),
+            3 => truth.positions.truncate(1),
+            4 => truth.visible.truncate(1),
+            5 => valid.truncate(1),
+            _ => moving.truncate(1),
+        }
+        let mut scores = FieldScores::default();
+        scores.add(&tracks, &truth, &valid, &moving);
+        assert_eq!(scores.report(), expected.report(), "{short}");
+    }
+    // The truth's own standard deviation is not asked for.
+    let mut scores = FieldScores::default();
+    scores.add(&row(&[1.0], &[true], &[0.5]), &row(&[0.0], &[true], &[]), &[true], &[false]);
+    assert_eq!(scores.report(), expected.report());
+}
+
+#[test]
+fn a_sigma_of_negative_zero_is_zero() {
+    let mut calibration = Calibration::default();
+    calibration.add([0.0, 1.0], std::hint::black_box(-0.0));
+    assert_eq!(calibration.overall(), Some([0.5, 0.5]));
+    assert!(calibration.deciles().iter().all(|decile| decile.from == 0.0));
+}
+
+#[test]
 fn what_is_not_a_number_counts_as_the_diagonal_and_is_never_within() {
     let exact = row(&[0.0; 3], &[true; 3], &[0.1; 3]);
     let tracks = row(&[f32::NAN, f32::INFINITY, 0.0], &[true; 3], &[1.0, f32::INFINITY, f32::NAN]);
