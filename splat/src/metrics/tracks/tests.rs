@@ -53,6 +53,25 @@ fn errors_and_visibility_are_those_counted_by_hand() {
 }
 
 #[test]
+fn each_frame_has_its_own_errors() {
+    // Seen, seen and moving, hidden, unknown.
+    let exact = row(&[0.0; 4], &[true, true, false, true], &[0.1; 4]);
+    let (valid, moving) = ([true, true, true, false], [false, true, true, true]);
+    let mut scores = FieldScores::default();
+    let mut frame =
+        |shifts: &[f32]| scores.add(&row(shifts, &[false; 4], &[1.0; 4]), &exact, &valid, &moving);
+    let (first, second) = (frame(&[1.0, 2.5, 9.0, 9.0]), frame(&[3.0, 0.5, 9.0, 9.0]));
+    let sum = |count, sum| ErrorSum { count, sum };
+    assert_eq!(first, FrameErrors { all: sum(2, 3.5), moving: sum(1, 2.5) });
+    assert_eq!(second, FrameErrors { all: sum(2, 3.5), moving: sum(1, 0.5) });
+    let mut both = first;
+    both.merge(second);
+    assert_eq!((both.all.mean(), both.moving.mean()), (Some(1.75), Some(1.5)));
+    assert_eq!(scores.report().all.endpoint.unwrap().mean, 1.75);
+    assert_eq!(ErrorSum::default().mean(), None);
+}
+
+#[test]
 fn nothing_has_no_figures() {
     let report = FieldScores::default().report();
     assert_eq!(report.all.endpoint, None);
