@@ -209,7 +209,9 @@ impl ViewScores {
             Ok(())
         };
         match source {
-            TrackSource::Tracker(tracker, settings) => views.track(position, tracker, settings, &mut take)?,
+            TrackSource::Tracker(tracker, settings) => {
+                views.track(position, tracker, settings, &mut |index, _, field| take(index, field))?;
+            }
             TrackSource::File(file) => {
                 for (index, field) in (1..).zip(open_tracks(views, position, file)?.fields()) {
                     take(index, field)?;
