@@ -53,8 +53,8 @@ pub(crate) struct JobArgs {
     #[arg(long, value_name = "FILE", help_heading = "Input")]
     pub(crate) static_model: Option<PathBuf>,
 
-    /// Where tracks come from: `exact` reads the clip's flow/<view>.npz, files are npz per training view [default:
-    /// the built-in tracker].
+    /// Where tracks come from: `exact` reads the clip's flow/<view>.npz, files are npz per training view,
+    /// named after the views or in their order [default: the built-in tracker].
     #[arg(long, value_name = "exact|FILE", num_args = 1.., help_heading = "Input")]
     pub(crate) tracks: Vec<String>,
 

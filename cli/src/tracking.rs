@@ -1,14 +1,12 @@
 //! What `track` and `eval-tracks` share: which views and frames of a clip, and how they are tracked.
 
-use std::{
-    fs::File,
-    io::Read,
-    path::{Path, PathBuf},
-};
+use std::{cell::RefCell, fs::File, io::Read, path::PathBuf, sync::Arc};
 
 use clap::Args;
 use splat::{
     clip::{Clip, ClipOptions, Split},
+    formats::track_npz::files_by_view,
+    image::Image,
     tracking::{
         TrackField, Tracker, TrackingSettings,
         learned::{LearnedError, MAX_MODEL_BYTES},
@@ -109,6 +107,29 @@ impl From<LearnedError> for Stop {
     }
 }
 
+/// Images by index as `read` gives them; the last one is there for whoever asks for it again.
+struct KeepsLast<F> {
+    read: F,
+    last: RefCell<Option<(usize, Arc<Image>)>>,
+}
+
+impl<F: Fn(usize) -> Result<Arc<Image>, CliError>> KeepsLast<F> {
+    fn new(read: F) -> Self {
+        Self { read, last: RefCell::new(None) }
+    }
+
+    fn get(&self, index: usize) -> Result<Arc<Image>, CliError> {
+        if let Some((held, image)) = &*self.last.borrow()
+            && *held == index
+        {
+            return Ok(Arc::clone(image));
+        }
+        let image = (self.read)(index)?;
+        self.last.replace(Some((index, Arc::clone(&image))));
+        Ok(image)
+    }
+}
+
 /// A clip and those of its views that are meant.
 #[derive(Debug)]
 pub(crate) struct ChosenViews {
@@ -121,7 +142,7 @@ impl ChosenViews {
     pub(crate) fn open(args: &ViewsArgs) -> Result<Self, CliError> {
         let options = ClipOptions {
             frames: args.frames.map(|range| (range.first, range.last)),
-            // Every image is looked at once.
+            // Every image is looked at while it is the latest, which `KeepsLast` holds.
             cache_bytes: 0,
             ..ClipOptions::default()
         };
@@ -143,42 +164,34 @@ impl ChosenViews {
         &self.clip().views()[position].name
     }
 
-    /// Tracks of one view, given frame by frame: `take(i, field)`, from index 1.
+    /// Tracks of one view, given frame by frame: `take(i, image, field)`, from index 1.
     pub(crate) fn track(
         &self,
         position: usize,
         tracker: &Tracker,
         settings: &TrackingSettings,
-        take: &mut dyn FnMut(usize, TrackField) -> Result<(), CliError>,
+        take: &mut dyn FnMut(usize, &Image, TrackField) -> Result<(), CliError>,
     ) -> Result<(), CliError> {
         let clip = self.clip();
-        let mut load = |index: usize| {
-            Ok::<_, Stop>(clip.image(position, index).map_err(|error| CliError::BadInput(error.to_string()))?)
+        let images = KeepsLast::new(|index| {
+            clip.image(position, index).map_err(|error| CliError::BadInput(error.to_string()))
+        });
+        let mut load = |index: usize| Ok::<_, Stop>(images.get(index)?);
+        // A tracker gives the field of a frame before it asks for the next image.
+        let mut emit = |index: usize, field: TrackField| {
+            let image = images.get(index)?;
+            Ok(take(index, &image, field)?)
         };
-        let mut emit = |index: usize, field: TrackField| Ok(take(index, field)?);
         let ended = tracker.track_view(clip.frames().len(), &mut load, settings, &mut emit);
         ended.map_err(|Stop(error)| error)
     }
 
-    /// The file of each chosen view: by name where every file is named after a chosen view, else by order.
-    pub(crate) fn files<'a>(&self, files: &'a [PathBuf]) -> Result<Vec<&'a Path>, CliError> {
-        let names: Vec<&str> = self.positions.iter().map(|&position| self.name(position)).collect();
-        let stem = |file: &'a PathBuf| file.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
-        let by_name = files.iter().all(|file| names.contains(&stem(file)));
-        let of_view = |(rank, name): (usize, &&str)| {
-            let found = if by_name { files.iter().find(|file| stem(file) == *name) } else { files.get(rank) };
-            found.map(PathBuf::as_path).ok_or_else(|| {
-                CliError::bad_input(
-                    "--tracks",
-                    format!(
-                        "no file for view '{name}' among {}; give one npz per view, in view order or named after the \
-                         views, or choose views with --views",
-                        files.len()
-                    ),
-                )
-            })
-        };
-        names.iter().enumerate().map(of_view).collect()
+    /// The file of each chosen view.
+    pub(crate) fn files<'a>(&self, files: &'a [PathBuf]) -> Result<Vec<&'a PathBuf>, CliError> {
+        let chosen: Vec<&str> = self.positions.iter().map(|&position| self.name(position)).collect();
+        let all: Vec<&str> = self.clip().views().iter().map(|view| view.name.as_str()).collect();
+        files_by_view(files, &chosen, &all)
+            .map_err(|error| CliError::bad_input("--tracks", format!("{error}; --views chooses views")))
     }
 }
 
@@ -220,6 +233,26 @@ mod tests {
             assert_eq!(error.exit_code(), 3);
             assert!(error.to_string().contains(wrong), "{error}");
         }
+    }
+
+    #[test]
+    fn an_image_that_is_asked_for_again_is_not_read_again() {
+        let read = RefCell::new(Vec::new());
+        let images = KeepsLast::new(|index| {
+            read.borrow_mut().push(index);
+            match index {
+                9 => Err(CliError::failed("frame 9", "it is broken")),
+                _ => Ok(Arc::new(Image::filled(1, 1, [index as f32; 3]))),
+            }
+        });
+        for index in [0, 1, 1, 2, 2, 1] {
+            let image = images.get(index).expect("it can be read");
+            assert_eq!(image.pixels[0], index as f32);
+        }
+        assert_eq!(*read.borrow(), [0, 1, 2, 1]);
+        assert!(images.get(9).is_err() && images.get(9).is_err(), "a failure is no image");
+        assert!(images.get(1).is_ok());
+        assert_eq!(*read.borrow(), [0, 1, 2, 1, 9, 9]);
     }
 
     #[test]

@@ -27,12 +27,13 @@ impl InputFile {
 
     /// File name.
     pub(crate) fn name(&self) -> &str {
-        Path::new(&self.path).file_name().and_then(|name| name.to_str()).unwrap_or_default()
+        self.as_ref().file_name().and_then(|name| name.to_str()).unwrap_or_default()
     }
+}
 
-    /// File name without its ending.
-    pub(crate) fn stem(&self) -> &str {
-        Path::new(&self.path).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default()
+impl AsRef<Path> for InputFile {
+    fn as_ref(&self) -> &Path {
+        Path::new(&self.path)
     }
 }
 
@@ -44,6 +45,8 @@ pub(crate) enum TrackSource {
     Own,
     /// The clip's own, in order of the training views; none where the job needs no tracks.
     Exact(Vec<InputFile>),
+    /// In order of the training views. Another name than `files`, under which earlier versions stored them as they came.
+    #[serde(rename = "view-files")]
     Files(Vec<InputFile>),
     /// Computed by a neural network from this file.
     Learned(InputFile),
@@ -59,8 +62,6 @@ pub(crate) struct JobRequest {
     /// `None`: reconstruct it.
     pub(crate) static_model: Option<InputFile>,
     pub(crate) tracks: TrackSource,
-    /// Whether every track file is named after a training view.
-    pub(crate) track_files_by_name: bool,
     /// Positions of the training views in the clip.
     pub(crate) training_positions: Vec<usize>,
     /// Where the clip was copied from; holds no credentials.
@@ -98,17 +99,8 @@ impl JobRequest {
         if let TrackSource::Learned(model) = &mut request.tracks {
             nameless(model);
         }
-        if let TrackSource::Exact(files) = &mut request.tracks {
+        if let TrackSource::Exact(files) | TrackSource::Files(files) = &mut request.tracks {
             files.iter_mut().for_each(nameless);
-        }
-        if let TrackSource::Files(files) = &mut request.tracks {
-            let by_name = self.track_files_by_name;
-            files
-                .iter_mut()
-                .for_each(|file| file.path = if by_name { file.stem().to_owned() } else { String::new() });
-            if by_name {
-                files.sort_by(|a, b| a.path.cmp(&b.path));
-            }
         }
         digest_of(&(settings, request))
     }
@@ -134,16 +126,13 @@ mod tests {
         let some_frames = JobRequest { frames: Some((1, 2)), ..request.clone() };
         assert_ne!(request.settings_digest(&settings), some_frames.settings_digest(&settings));
 
-        let named = |files: Vec<InputFile>| JobRequest {
-            tracks: TrackSource::Files(files),
-            track_files_by_name: true,
-            ..JobRequest::default()
+        let tracked = |files: Vec<InputFile>| {
+            let request = JobRequest { tracks: TrackSource::Files(files), ..JobRequest::default() };
+            request.settings_digest(&settings)
         };
-        let forward = named(vec![file("/a/cam00.npz", "1"), file("/a/cam01.npz", "2")]);
-        let backward = named(vec![file("/b/cam01.npz", "2"), file("/b/cam00.npz", "1")]);
-        assert_eq!(forward.settings_digest(&settings), backward.settings_digest(&settings));
-        let swapped = named(vec![file("/a/cam00.npz", "2"), file("/a/cam01.npz", "1")]);
-        assert_ne!(forward.settings_digest(&settings), swapped.settings_digest(&settings));
+        let digest = tracked(vec![file("/a/cam00.npz", "1"), file("/a/cam01.npz", "2")]);
+        assert_eq!(digest, tracked(vec![file("/b/first.npz", "1"), file("/b/second.npz", "2")]));
+        assert_ne!(digest, tracked(vec![file("/a/cam00.npz", "2"), file("/a/cam01.npz", "1")]));
 
         let by = |model| JobRequest { tracks: TrackSource::Learned(model), ..JobRequest::default() };
         let digest = |path: &str, content: &str| by(file(path, content)).settings_digest(&settings);

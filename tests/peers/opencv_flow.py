@@ -12,8 +12,11 @@ views and frames and by the same definitions:
   whatever the method says of them; "moving" are those inside the key frame's mask.
 * "direct" is the flow from the key frame to the frame; "chained" adds the flows of successive frames, read bilinearly
   at the place reached.
+* OpenCV's methods get grey images, which is all that they take. Ours matches in colour; its row "on luma" is measured
+  with `--set tracking.colour=false`, and sees what they see.
 * Lucas-Kanade (pyramidal, window 21, four levels) is asked for every fourth pixel of every fourth row, and
-  interpolated between them: asked for every pixel it takes a second per pair.
+  interpolated between them: asked for every pixel it takes a second per pair. Points that it reports as lost have no
+  position: they move as the nearest found point of the same grid does; if none is found, all rest.
 * Flow methods say nothing of visibility, which the average Jaccard needs: visible is what stays inside the image and
   agrees with the flow back, |f+b|^2 < 0.01 (|f|^2+|b|^2) + 0.5 (Sundaram et al., 2010), in every step of a chain.
 * Points: bilinear between pixel centres, visibility of the nearest pixel, TAP-Vid's thresholds at 256x256, mean over
@@ -46,9 +49,22 @@ def lucas_kanade(a, b, step=4):
     height, width = a.shape
     points = grid(width, height)[step // 2 :: step, step // 2 :: step]
     asked = points.reshape(-1, 1, 2).astype(np.float32)
-    found, _, _ = cv2.calcOpticalFlowPyrLK(a, b, asked, None, winSize=(21, 21), maxLevel=3)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(a, b, asked, None, winSize=(21, 21), maxLevel=3)
     sparse = (found - asked).reshape(points.shape)
-    return fetch(sparse.astype(float), (grid(width, height) - step // 2) / step)
+    sparse = of_nearest_found(sparse.astype(float), status.reshape(points.shape[:2]) == 1)
+    return fetch(sparse, (grid(width, height) - step // 2) / step)
+
+
+def of_nearest_found(field, found):
+    """`field` [H, W, 2] with the value of the nearest found entry where `found` [H, W] is false; 0 if none is found."""
+    if not found.any():
+        return np.zeros_like(field)
+    taken, lost = np.argwhere(found), np.argwhere(~found)
+    filled = field.copy()
+    for y, x in lost:
+        near = taken[((taken - (y, x)) ** 2).sum(-1).argmin()]
+        filled[y, x] = field[tuple(near)]
+    return filled
 
 
 METHODS = {
@@ -188,8 +204,9 @@ class Scores:
         }
 
 
-def ours(program, clip, views, quality):
+def ours(program, clip, views, quality, colour):
     command = [program, "eval-tracks", str(clip), "--json", "--quality", quality]
+    command += ["--set", f"tracking.colour={'true' if colour else 'false'}"]
     if views:
         command += ["--views", ",".join(views)]
     report = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
@@ -226,7 +243,8 @@ def accuracy(folder, arguments):
         rows += [(f"{name}, {kind}", score.row()) for kind, score in scores.items()]
     if arguments.program:
         for quality in arguments.quality.split(","):
-            rows.append((f"**ours, {quality}**", ours(arguments.program, folder, views, quality)))
+            for name, colour in [(quality, True), (f"{quality}, on luma", False)]:
+                rows.append((f"**ours, {name}**", ours(arguments.program, folder, views, quality, colour)))
     print_table(clip.folder.name, rows)
 
 
@@ -262,4 +280,5 @@ def main():
         speed(folder) if arguments.speed else accuracy(folder, arguments)
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -9,6 +9,9 @@ use trackersplat_tests::{clips, program};
 /// The cheapest tracks: what is said of them matters here, not how good they are.
 const QUICK: [&str; 4] = ["--quality", "draft", "--set", "tracking.max_side=160"];
 
+/// The images as they are: standard deviations are smallest where nothing is scaled.
+const WHOLE: [&str; 2] = ["--quality", "draft"];
+
 fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
@@ -35,7 +38,7 @@ fn tracks_are_written_pictured_and_measure_the_same_from_the_file() {
     let clip = text(clip.path());
     let folder = tempfile::tempdir().unwrap();
     let (out, pictures) = (folder.path().join("tracks"), folder.path().join("pictures"));
-    let line = [&["track", clip, "--out", text(&out), "--pictures", text(&pictures), "--quiet"], &QUICK[..]];
+    let line = [&["track", clip, "--out", text(&out), "--pictures", text(&pictures), "--quiet"], &WHOLE[..]];
     let said = succeeds(&line.concat());
     let files = ["cam00", "cam01"].map(|view| out.join(format!("{view}.npz")));
     for (view, file) in ["cam00", "cam01"].iter().zip(&files) {
@@ -47,7 +50,7 @@ fn tracks_are_written_pictured_and_measure_the_same_from_the_file() {
     }
 
     let errors = folder.path().join("errors");
-    let own = [&["eval-tracks", clip, "--json", "--quiet", "--pictures", text(&errors)], &QUICK[..]].concat();
+    let own = [&["eval-tracks", clip, "--json", "--quiet", "--pictures", text(&errors)], &WHOLE[..]].concat();
     let own: Value = serde_json::from_str(&succeeds(&own)).unwrap();
     // The second view's file first: names decide, not the order.
     let from_files = ["eval-tracks", clip, "--json", "--quiet", "--tracks", text(&files[1]), text(&files[0])];
@@ -59,9 +62,21 @@ fn tracks_are_written_pictured_and_measure_the_same_from_the_file() {
     let moving = &own["pixels"]["moving"]["endpoint"];
     // Objects of the clip move by 40 px and more.
     assert!(moving["pixels"].as_u64().unwrap() > 1000 && moving["median"].as_f64().unwrap() < 2.0, "{own}");
-    assert_eq!(own["pixels"]["all"]["deciles"].as_array().unwrap().len(), 10);
+    let deciles = own["pixels"]["all"]["deciles"].as_array().unwrap();
+    assert_eq!(deciles.len(), 10);
+    // Small enough that any floor of what is read would show.
+    assert!(deciles[0]["from"].as_f64().unwrap() < 0.05, "{own}");
     assert_eq!(own["points"], Value::Null);
-    assert_eq!(own["by_frame"][0]["frame"], 2);
+    // There is one later frame: its errors are those of the clip.
+    let [frame] = own["by_frame"].as_array().unwrap().as_slice() else { panic!("{own}") };
+    assert_eq!(frame["frame"], 2);
+    for group in ["all", "moving"] {
+        let whole = &own["pixels"][group]["endpoint"];
+        assert_eq!(frame[group]["pixels"], whole["pixels"]);
+        let means = [&frame[group]["mean"], &whole["mean"]].map(|mean| mean.as_f64().unwrap());
+        // Sums of doubles, added by view and in one go.
+        assert!((means[0] - means[1]).abs() < 1e-9 * means[1], "{means:?}");
+    }
 }
 
 #[test]
@@ -94,7 +109,12 @@ fn wrong_input_names_what_is_wrong_and_the_remedy() {
     let line = ["track", clip, "--out", text(&file), "--set", "refine.iterations=3"];
     is_refused(&line, &["refine.iterations=3", "tracking."]);
     is_refused(&["eval-tracks", clip, "--views", "test00"], &["flow/test00.npz", "--views"]);
-    is_refused(&["eval-tracks", clip, "--tracks", text(&file)], &["cam01", "one npz per view"]);
+    is_refused(
+        &["eval-tracks", clip, "--tracks", text(&file)],
+        &["cam00, cam01", "one npz per view", "--views"],
+    );
+    let line = ["eval-tracks", clip, "--views", "cam01", "--tracks", "cam00.npz"];
+    is_refused(&line, &["cam00.npz", "'cam01'", "named after the views"]);
     is_refused(&["eval-tracks", clip, "--views", "cam00", "--tracks", text(&file)], &["one.npz"]);
     let (code, said) = program::run(["eval-tracks", clip, "--tracks", text(&file), "--quality", "best"]);
     assert_eq!(code, 2, "{said}");

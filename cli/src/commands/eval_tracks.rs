@@ -8,7 +8,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 use splat::{
     formats::track_npz::{self, ImportedTracks, PointTracks},
-    metrics::tracks::{FieldReport, FieldScores, GroupReport, PointReport, PointScores},
+    metrics::tracks::{
+        ErrorSum, FieldReport, FieldScores, FrameErrors, GroupReport, PointReport, PointScores,
+    },
     tracking::{TrackField, Tracker, TrackingSettings},
 };
 
@@ -30,7 +32,7 @@ pub(crate) struct EvalTracksArgs {
     #[command(flatten)]
     views: ViewsArgs,
 
-    /// Tracks to measure, an npz per view, in view order or named after the views, in any convention of
+    /// Tracks to measure, an npz per view, named after the views or in their order, in any convention of
     /// docs/trackers.md [default: the tracker's].
     #[arg(long, value_name = "FILE", num_args = 1.., help_heading = "Input",
           conflicts_with_all = ["tracker", "quality", "settings", "set"])]
@@ -59,7 +61,7 @@ struct Report {
     pixels: FieldReport,
     /// TAP-Vid scores, the mean over views; none if the clip has no points.
     points: Option<Points>,
-    by_frame: Vec<FrameErrors>,
+    by_frame: Vec<FrameMeans>,
 }
 
 #[derive(Debug, Serialize)]
@@ -69,14 +71,14 @@ struct Points {
 }
 
 /// Mean end-point errors of one frame, pixels.
-#[derive(Clone, Debug, Serialize)]
-struct FrameErrors {
+#[derive(Debug, Serialize)]
+struct FrameMeans {
     frame: u32,
     all: Mean,
     moving: Mean,
 }
 
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Debug, Serialize)]
 struct Mean {
     pixels: u64,
     mean: Option<f64>,
@@ -124,9 +126,9 @@ enum TrackSource<'a> {
     File(&'a Path),
 }
 
-/// Exact tracks of one view.
+/// Exact tracks of one view. Fields are made as they are needed: all of them take three times what the file holds.
 struct Truth {
-    fields: Vec<TrackField>,
+    fields: ImportedTracks,
     valid: Vec<bool>,
     moving: Vec<bool>,
 }
@@ -141,16 +143,16 @@ impl Truth {
             return Err(bad(why.to_owned()));
         }
         let fields =
-            track_npz::read_exact_flow(&path).map_err(|error| CliError::BadInput(error.to_string()))?;
+            track_npz::open_exact_flow(&path).map_err(|error| CliError::BadInput(error.to_string()))?;
         let camera = &clip.views()[position].camera;
         let size = (camera.width, camera.height);
-        if let Some(field) = fields.iter().find(|field| (field.width, field.height) != size) {
-            let found = format!("it is for {}x{} pixels", field.width, field.height);
+        if fields.size() != size {
+            let found = format!("it is for {}x{} pixels", fields.size().0, fields.size().1);
             return Err(bad(format!("{found}, the view has {}x{}; render the flow again", size.0, size.1)));
         }
         let last = clip.frames().last().map_or(0, |&frame| frame as usize);
-        if fields.len() + 1 < last {
-            let reach = fields.len() + 1;
+        if fields.count() + 1 < last {
+            let reach = fields.count() + 1;
             return Err(bad(format!(
                 "it reaches frame {reach}, the clip frame {last}; measure --frames 1..{reach}"
             )));
@@ -160,6 +162,13 @@ impl Truth {
         let mask = clip.mask(position, 0).map_err(|error| CliError::BadInput(error.to_string()))?;
         let moving = mask.map_or_else(|| vec![false; valid.len()], |mask| mask.inside.clone());
         Ok(Self { fields, valid, moving })
+    }
+
+    /// The exact field of a frame of the clip, by its number.
+    fn at(&self, frame: u32) -> Result<TrackField, CliError> {
+        // The clip begins with frame 1, and `read` made sure that the flow reaches its last one.
+        let field = frame.checked_sub(2).and_then(|index| self.fields.field(index as usize));
+        field.ok_or_else(|| CliError::failed(format!("frame {frame}"), "it has no exact flow"))
     }
 }
 
@@ -186,21 +195,23 @@ impl ViewScores {
             Self { fields: FieldScores::default(), frames: Vec::new(), points: Default::default() };
         let mut take = |index: usize, field: TrackField| {
             let frame = views.clip().frames()[index];
-            let exact = &truth.fields[frame as usize - 2];
-            scores.add(frame, &field, exact, &truth);
+            let exact = truth.at(frame)?;
+            scores.frames.push(scores.fields.add(&field, &exact, &truth.valid, &truth.moving));
             for (scores, moving) in scores.points.iter_mut().zip([false, true]) {
                 let queries = points
                     .and_then(|points| points.queries(&view.name, &view.camera, frame as usize - 1, moving));
                 scores.add(&field, queries.unwrap_or_default());
             }
             if let Some(folder) = &folder {
-                folder.write("error", frame, &pictures::error(&field, exact))?;
+                folder.write("error", frame, &pictures::error(&field, &exact))?;
             }
             bar.inc(1);
             Ok(())
         };
         match source {
-            TrackSource::Tracker(tracker, settings) => views.track(position, tracker, settings, &mut take)?,
+            TrackSource::Tracker(tracker, settings) => {
+                views.track(position, tracker, settings, &mut |index, _, field| take(index, field))?;
+            }
             TrackSource::File(file) => {
                 for (index, field) in (1..).zip(open_tracks(views, position, file)?.fields()) {
                     take(index, field)?;
@@ -208,19 +219,6 @@ impl ViewScores {
             }
         }
         Ok(scores)
-    }
-
-    fn add(&mut self, frame: u32, field: &TrackField, exact: &TrackField, truth: &Truth) {
-        let mut of_frame = FieldScores::default();
-        of_frame.add(field, exact, &truth.valid, &truth.moving);
-        let report = of_frame.report();
-        let mean = |group: &GroupReport| {
-            group
-                .endpoint
-                .map_or(Mean::default(), |error| Mean { pixels: error.pixels, mean: Some(error.mean) })
-        };
-        self.frames.push(FrameErrors { frame, all: mean(&report.all), moving: mean(&report.moving) });
-        self.fields.merge(&of_frame);
     }
 }
 
@@ -242,37 +240,35 @@ fn open_tracks(views: &ChosenViews, position: usize, file: &Path) -> Result<Impo
     Ok(tracks)
 }
 
-impl Mean {
-    /// The mean over what both are about.
-    fn with(self, other: Self) -> Self {
-        let pixels = self.pixels + other.pixels;
-        let sum = |mean: Self| mean.mean.unwrap_or(0.0) * mean.pixels as f64;
-        Self { pixels, mean: (pixels > 0).then(|| (sum(self) + sum(other)) / pixels as f64) }
+impl From<ErrorSum> for Mean {
+    fn from(errors: ErrorSum) -> Self {
+        Self { pixels: errors.count, mean: errors.mean() }
     }
 }
 
 impl Report {
     fn new(views: &ChosenViews, has_points: bool, measured: &[ViewScores]) -> Self {
         let mut pixels = FieldScores::default();
-        let mut by_frame: Vec<FrameErrors> = Vec::new();
+        let frames = views.clip().frames();
+        let mut by_frame = vec![FrameErrors::default(); frames.len() - 1];
         for view in measured {
             pixels.merge(&view.fields);
-            if by_frame.is_empty() {
-                by_frame.clone_from(&view.frames);
-                continue;
-            }
-            for (sum, frame) in by_frame.iter_mut().zip(&view.frames) {
-                sum.all = sum.all.with(frame.all);
-                sum.moving = sum.moving.with(frame.moving);
+            for (sum, errors) in by_frame.iter_mut().zip(&view.frames) {
+                sum.merge(*errors);
             }
         }
+        let means = |(&frame, errors): (&u32, FrameErrors)| FrameMeans {
+            frame,
+            all: errors.all.into(),
+            moving: errors.moving.into(),
+        };
         Self {
             clip: views.clip().root().to_owned(),
             views: views.positions.iter().map(|&position| views.name(position).to_owned()).collect(),
-            frames: views.clip().frames().to_vec(),
+            frames: frames.to_vec(),
             pixels: pixels.report(),
             points: has_points.then(|| Points::new(measured)),
-            by_frame,
+            by_frame: frames[1..].iter().zip(by_frame).map(means).collect(),
         }
     }
 

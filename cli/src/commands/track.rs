@@ -7,6 +7,7 @@ use indicatif::ProgressBar;
 use rayon::prelude::*;
 use splat::{
     formats::track_npz::TrackNpzWriter,
+    image::Image,
     tracking::{TrackField, Tracker, TrackingSettings},
 };
 
@@ -105,10 +106,10 @@ impl ViewRun<'_> {
             )),
             None => None,
         };
-        self.views.track(self.position, self.tracker, self.settings, &mut |index, field| {
+        self.views.track(self.position, self.tracker, self.settings, &mut |index, frame, field| {
             writer.push(&field).map_err(failed)?;
             if let Some((folder, trails)) = &mut album {
-                self.draw(folder, trails, index, &field)?;
+                self.draw(folder, trails, index, frame, &field)?;
             }
             bar.inc(1);
             Ok(())
@@ -123,14 +124,12 @@ impl ViewRun<'_> {
         folder: &PictureFolder,
         trails: &mut Trails,
         index: usize,
+        frame: &Image,
         field: &TrackField,
     ) -> Result<(), CliError> {
-        let clip = self.views.clip();
-        let number = clip.frames()[index];
-        let frame =
-            clip.image(self.position, index).map_err(|error| CliError::BadInput(error.to_string()))?;
+        let number = self.views.clip().frames()[index];
         folder.write("flow", number, &pictures::flow(field))?;
-        folder.write("tracks", number, &trails.draw(&frame, field))?;
+        folder.write("tracks", number, &trails.draw(frame, field))?;
         folder.write("uncertainty", number, &pictures::uncertainty(field))
     }
 }

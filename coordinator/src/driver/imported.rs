@@ -97,25 +97,15 @@ impl Job {
         Ok(missing)
     }
 
-    /// The imported file of a training view: by name where every file is named after a view, else by order, as are those
-    /// of the clip.
+    /// The imported file of a training view.
     pub(super) fn track_file(&self, position: usize, view: &str) -> Result<&InputFile, StageError> {
         let (TrackSource::Files(files) | TrackSource::Exact(files)) = &self.request.tracks else {
             return Err(StageError::new(FailureKind::Bug, "the job imports no tracks"));
         };
-        let found = match self.request.track_files_by_name {
-            true => files.iter().find(|file| file.stem() == view),
-            false => {
-                let rank = self.request.training_positions.iter().position(|&known| known == position);
-                rank.and_then(|rank| files.get(rank))
-            }
-        };
-        found.ok_or_else(|| {
-            StageError::bad_input(format!(
-                "no track file for the training view '{view}' among {} files; give one npz per training view, in view \
-                 order or named after the views",
-                files.len()
-            ))
+        let rank = self.request.training_positions.iter().position(|&known| known == position);
+        // At submission every training view had its file.
+        rank.and_then(|rank| files.get(rank)).ok_or_else(|| {
+            StageError::new(FailureKind::Bug, format!("the job has no track file for view '{view}'"))
         })
     }
 }

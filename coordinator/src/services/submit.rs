@@ -7,6 +7,7 @@ use std::{
 
 use splat::{
     clip::{Clip, Split},
+    formats::track_npz::files_by_view,
     settings::{MotionSource, Settings},
     tracking::learned::LearnedTracker,
 };
@@ -229,8 +230,11 @@ fn read(
     let training = clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train);
     let (positions, names): (Vec<usize>, Vec<&str>) =
         training.map(|(position, view)| (position, view.name.as_str())).unzip();
-    if let TrackSource::Files(files) = &job_request.tracks {
-        job_request.track_files_by_name = files.iter().all(|file| names.contains(&file.stem()));
+    if let TrackSource::Files(files) = &mut job_request.tracks {
+        let all: Vec<&str> = clip.views().iter().map(|view| view.name.as_str()).collect();
+        let of_views = files_by_view(files, &names, &all);
+        let of_views = of_views.map_err(|error| Status::invalid_argument(format!("track files: {error}")))?;
+        *files = of_views.into_iter().cloned().collect();
     }
     let needs_tracks = settings.motion_source != MotionSource::None && clip.frames().len() > 1;
     if let TrackSource::Exact(files) = &mut job_request.tracks

@@ -10,5 +10,6 @@ mod remote_clips;
 mod reports;
 mod restart;
 mod runs;
+mod track_files;
 mod tracks;
 mod transfers;

@@ -12,17 +12,21 @@ use trackersplat_proto::v1::{
 use super::harness::*;
 
 /// A field of the clip's size whose tracks all move by `x` pixels.
-fn encoded(width: u32, x: f32) -> Vec<u8> {
+pub(super) fn shifted(width: u32, x: f32) -> TrackField {
     let pixels = width as usize * 6;
     let centre =
         |index: usize| [(index % width as usize) as f32 + 0.5, (index / width as usize) as f32 + 0.5];
-    track_blob::encode(&TrackField {
+    TrackField {
         width,
         height: 6,
         positions: (0..pixels).map(|index| [centre(index)[0] + x, centre(index)[1]]).collect(),
         visible: vec![true; pixels],
         sigma: vec![0.5; pixels],
-    })
+    }
+}
+
+fn encoded(width: u32, x: f32) -> Vec<u8> {
+    track_blob::encode(&shifted(width, x))
 }
 
 async fn field(bench: &Bench, frame: u32) -> TrackedField {

@@ -2,8 +2,12 @@
 
 use std::{fs, path::Path};
 
-use anyhow::{Context, Result};
-use splat::image::{Image, Mask};
+use anyhow::{Context, Result, bail};
+use splat::{
+    formats::track_npz::{self, ImportedTracks},
+    image::{Image, Mask},
+    tracking::TrackField,
+};
 
 /// A clip, as far as it is measured.
 pub(crate) struct Clip {
@@ -15,10 +19,8 @@ pub(crate) struct Clip {
 pub(crate) struct View {
     pub(crate) frames: Vec<Image>,
     moving: Vec<bool>,
-    /// In 64ths of a pixel, `frame * pixels * 2`.
-    flow: Vec<i16>,
-    visible: Vec<u8>,
-    valid: Vec<u8>,
+    /// From the first frame to each later one.
+    exact: ImportedTracks,
 }
 
 impl Clip {
@@ -32,41 +34,29 @@ impl Clip {
 
 impl View {
     fn read(folder: &Path, camera: &str) -> Result<Self> {
-        let images = folder.join("images").join(camera);
-        let name = |i: usize| format!("frame_{i:04}.png");
-        let count = fs::read_dir(&images)?.count();
-        let read = |i: usize| Ok(Image::decode(&fs::read(images.join(name(i)))?)?);
-        let frames = (1..=count).map(read).collect::<Result<_>>()?;
-        let mask = Mask::decode(&fs::read(folder.join("masks").join(camera).join(name(1)))?)?;
-        let flow = folder.join("flow").join(format!("{camera}.npz"));
-        Ok(Self {
-            frames,
-            moving: mask.inside,
-            flow: array(&flow, "flow_x64")?,
-            visible: array(&flow, "visible")?,
-            valid: array(&flow, "valid")?,
-        })
+        let exact = track_npz::open_exact_flow(&folder.join("flow").join(format!("{camera}.npz")))?;
+        let bytes = |kind: &str, frame: usize| {
+            let path = folder.join(kind).join(camera).join(format!("frame_{frame:04}.png"));
+            fs::read(&path).with_context(|| path.display().to_string())
+        };
+        // Flow leads to every frame but the first.
+        let read = |frame: usize| Ok(Image::decode(&bytes("images", frame)?)?);
+        let frames: Vec<Image> = (1..=exact.count() + 1).map(read).collect::<Result<_>>()?;
+        let mask = Mask::decode(&bytes("masks", 1)?)?;
+        let sizes = frames.iter().map(|image| (image.width, image.height));
+        if let Some(size) = sizes.chain([(mask.width, mask.height)]).find(|&size| size != exact.size()) {
+            bail!("flow of {:?} pixels, but a frame or the mask of {size:?}", exact.size());
+        }
+        Ok(Self { frames, moving: mask.inside, exact })
     }
 
-    /// The exact displacement of a pixel of the first frame at a later frame, if it is visible there.
-    pub(crate) fn truth(&self, frame: usize, pixel: usize) -> Option<[f32; 2]> {
-        let pixels = self.moving.len();
-        let seen = bit(&self.visible[(frame - 1) * pixels.div_ceil(8)..], pixel) && bit(&self.valid, pixel);
-        let at = 2 * ((frame - 1) * pixels + pixel);
-        seen.then(|| [self.flow[at], self.flow[at + 1]].map(|value| f32::from(value) / 64.0))
+    /// The exact tracks of the first frame's pixels to a later frame.
+    pub(crate) fn truth(&self, frame: usize) -> Result<TrackField> {
+        let field = frame.checked_sub(1).and_then(|index| self.exact.field(index));
+        field.with_context(|| format!("no exact flow to frame {}", frame + 1))
     }
 
     pub(crate) fn moves(&self, pixel: usize) -> bool {
         self.moving[pixel]
     }
-}
-
-fn bit(bytes: &[u8], i: usize) -> bool {
-    bytes[i / 8] >> (7 - i % 8) & 1 == 1
-}
-
-fn array<T: npyz::Deserialize>(path: &Path, name: &str) -> Result<Vec<T>> {
-    let mut archive = npyz::npz::NpzArchive::open(path)?;
-    let array = archive.by_name(name)?.with_context(|| format!("no {name} in {}", path.display()))?;
-    Ok(array.into_vec()?)
 }

@@ -141,10 +141,12 @@ fn errors(clip: &Clip, settings: &TrackingSettings, enlarge: u32) -> Result<Erro
         let key = enlarged(0);
         for frame in 1..view.frames.len() {
             let flow = pair_flow(&key, &enlarged(frame), None, settings)?.forward;
-            for pixel in 0..(width * height) as usize {
-                let Some(exact) = view.truth(frame, pixel) else { continue };
+            let exact = view.truth(frame)?;
+            for pixel in (0..exact.positions.len()).filter(|&pixel| exact.visible[pixel]) {
+                let centre = [pixel as u32 % width, pixel as u32 / width].map(|index| index as f32 + 0.5);
+                let at = exact.positions[pixel];
                 let found = at_pixel(&flow, pixel, enlarge as usize);
-                let error = (found[0] - exact[0]).hypot(found[1] - exact[1]);
+                let error = (found[0] - (at[0] - centre[0])).hypot(found[1] - (at[1] - centre[1]));
                 all.push(error);
                 if view.moves(pixel) {
                     moving.push(error);

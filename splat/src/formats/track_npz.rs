@@ -27,6 +27,7 @@ use zip::ZipArchive;
 use super::TrackError;
 use crate::tracking::TrackField;
 
+mod by_view;
 mod conventions;
 mod grid;
 mod imported;
@@ -35,12 +36,13 @@ mod points;
 mod tests;
 mod writer;
 
+pub use by_view::{Names, TrackFilesError, files_by_view};
 pub use conventions::open_tracks;
 pub use imported::ImportedTracks;
 pub use points::PointTracks;
 pub use writer::TrackNpzWriter;
 
-/// Smallest standard deviation of imported tracks, pixels: below it interpolation and sampling err more than tracks.
+/// Standard deviation of what claims to be exact, pixels: interpolation and sampling err by so much.
 pub const SIGMA_FLOOR: f32 = 0.05;
 
 /// Standard deviation of imported tracks that state none, pixels.
@@ -120,8 +122,8 @@ pub fn read_exact_validity(path: &Path, width: u32, height: u32) -> Result<Vec<b
 /// Reads a tracker's fields of one view whole; index `i` is the field of frame `i + 2`, counting the key frame as 1.
 ///
 /// Positions that are not finite, and standard deviations that are negative or not a number, make their pixel
-/// invisible, at its place in the key frame. Standard deviations are raised to [`SIGMA_FLOOR`]; without a `sigma`
-/// array they are [`DEFAULT_SIGMA`].
+/// invisible, at its place in the key frame. Standard deviations are kept as they are stated, but for 0, which becomes
+/// [`SIGMA_FLOOR`]; without a `sigma` array they are [`DEFAULT_SIGMA`].
 pub fn read_track_npz(path: &Path) -> Result<Vec<TrackField>, TrackError> {
     let mut archive = Archive::open(path)?;
     let tracks = archive.floats(&POSITIONS)?;
@@ -163,7 +165,11 @@ fn fields_of(archive: &mut Archive<'_>, tracks: Array<f32>) -> Result<ImportedTr
             let sigma = sigma.as_ref().map_or(DEFAULT_SIGMA, |sigma| sigma.values[entry]);
             let known = position.iter().all(|value| value.is_finite()) && sigma.is_finite() && sigma >= 0.0;
             field.positions.push(if known { position } else { pixel_centre(index, columns) });
-            field.sigma.push(if known { sigma.max(SIGMA_FLOOR) } else { DEFAULT_SIGMA });
+            field.sigma.push(match known {
+                true if sigma > 0.0 => sigma,
+                true => SIGMA_FLOOR,
+                false => DEFAULT_SIGMA,
+            });
             field.visible.push(known && visible.values[entry] > 0.5);
         }
         field

@@ -157,7 +157,8 @@ mod tests {
             height: 2,
             positions,
             visible: (0..6).map(|i| i % 3 != 1).collect(),
-            sigma: (0..6).map(|i| 0.1 + 0.3 * i as f32).collect(),
+            // Far below the floor of what states none, and far above.
+            sigma: (0..6).map(|i| 0.001 * 10.0_f32.powi(i)).collect(),
         }
     }
 

@@ -44,7 +44,8 @@ impl Calibration {
     /// Counts the errors of a track along both axes. What is not a number is never within; a standard deviation that
     /// is none counts as 0.
     pub fn add(&mut self, error: [f32; 2], sigma: f32) {
-        let sigma = if sigma.is_finite() { sigma.max(0.0) } else { 0.0 };
+        // Adding zero makes the negative zero the positive one, whose bits are a bin.
+        let sigma = if sigma.is_finite() { sigma.max(0.0) + 0.0 } else { 0.0 };
         let bin = &mut self.bins[(sigma.to_bits() >> DROPPED_BITS) as usize];
         for error in error {
             bin.axes += 1;

@@ -59,6 +59,24 @@ pub struct EndpointError {
     pub p90: f64,
 }
 
+/// End-point errors of the pixels of one frame that are truly visible, by the groups of [`FieldScores`].
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct FrameErrors {
+    /// Every pixel whose truth is known.
+    pub all: ErrorSum,
+    /// Pixels on movers.
+    pub moving: ErrorSum,
+}
+
+/// How many errors there are, and their sum in pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ErrorSum {
+    /// Number of errors.
+    pub count: u64,
+    /// Their sum.
+    pub sum: f64,
+}
+
 /// Agreement on what is visible.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Visibility {
@@ -71,14 +89,24 @@ pub struct Visibility {
 }
 
 impl FieldScores {
-    /// Counts one frame of one view. `valid` and `moving` hold a flag per pixel: whether the truth is known, and
-    /// whether the pixel is on a mover.
+    /// Counts one frame of one view, and gives the frame's own errors. `valid` and `moving` hold a flag per pixel:
+    /// whether the truth is known, and whether the pixel is on a mover.
     ///
     /// A position that is not a number counts as an error of the image's diagonal. Nothing is counted beyond the
     /// shortest of the arrays.
-    pub fn add(&mut self, tracks: &TrackField, exact: &TrackField, valid: &[bool], moving: &[bool]) {
+    pub fn add(
+        &mut self,
+        tracks: &TrackField,
+        exact: &TrackField,
+        valid: &[bool],
+        moving: &[bool],
+    ) -> FrameErrors {
+        let mut frame = FrameErrors::default();
         let diagonal = (exact.width as f32).hypot(exact.height as f32);
-        let pixels = tracks.positions.len().min(exact.positions.len()).min(valid.len()).min(moving.len());
+        let held = [&tracks.positions, &exact.positions].map(Vec::len);
+        let flags = [&tracks.visible[..], &exact.visible, valid, moving].map(<[bool]>::len);
+        let lengths = held.into_iter().chain(flags).chain([tracks.sigma.len()]);
+        let pixels = lengths.min().unwrap_or_default();
         for i in (0..pixels).filter(|&i| valid[i]) {
             let (at, truth) = (tracks.positions[i], exact.positions[i]);
             let off = [at[0] - truth[0], at[1] - truth[1]];
@@ -93,7 +121,9 @@ impl FieldScores {
             self.all.add(&pixel);
             let other = if moving[i] { &mut self.moving } else { &mut self.still };
             other.add(&pixel);
+            frame.add(&pixel, moving[i]);
         }
+        frame
     }
 
     /// Adds the counts of another.
@@ -106,6 +136,37 @@ impl FieldScores {
     /// The figures so far.
     pub fn report(&self) -> FieldReport {
         FieldReport { all: self.all.report(), moving: self.moving.report(), still: self.still.report() }
+    }
+}
+
+impl FrameErrors {
+    fn add(&mut self, pixel: &Pixel, moves: bool) {
+        if !pixel.is_visible {
+            return;
+        }
+        let error = ErrorSum { count: 1, sum: pixel.distance.into() };
+        self.all.merge(error);
+        if moves {
+            self.moving.merge(error);
+        }
+    }
+
+    /// Adds the errors of another view at the same frame.
+    pub fn merge(&mut self, other: Self) {
+        self.all.merge(other.all);
+        self.moving.merge(other.moving);
+    }
+}
+
+impl ErrorSum {
+    fn merge(&mut self, other: Self) {
+        self.count += other.count;
+        self.sum += other.sum;
+    }
+
+    /// The mean error, or none of nothing.
+    pub fn mean(self) -> Option<f64> {
+        share(self.sum, self.count as f64)
     }
 }
 

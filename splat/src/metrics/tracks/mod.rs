@@ -12,7 +12,7 @@ mod points;
 mod tests;
 
 pub use calibration::{Calibration, SigmaDecile};
-pub use field::{EndpointError, FieldReport, FieldScores, GroupReport, Visibility};
+pub use field::{EndpointError, ErrorSum, FieldReport, FieldScores, FrameErrors, GroupReport, Visibility};
 pub use points::{POINT_THRESHOLDS, PointQuery, PointReport, PointScores, interpolated};
 
 /// `part / whole`, or none of nothing.

@@ -53,6 +53,25 @@ fn errors_and_visibility_are_those_counted_by_hand() {
 }
 
 #[test]
+fn each_frame_has_its_own_errors() {
+    // Seen, seen and moving, hidden, unknown.
+    let exact = row(&[0.0; 4], &[true, true, false, true], &[0.1; 4]);
+    let (valid, moving) = ([true, true, true, false], [false, true, true, true]);
+    let mut scores = FieldScores::default();
+    let mut frame =
+        |shifts: &[f32]| scores.add(&row(shifts, &[false; 4], &[1.0; 4]), &exact, &valid, &moving);
+    let (first, second) = (frame(&[1.0, 2.5, 9.0, 9.0]), frame(&[3.0, 0.5, 9.0, 9.0]));
+    let sum = |count, sum| ErrorSum { count, sum };
+    assert_eq!(first, FrameErrors { all: sum(2, 3.5), moving: sum(1, 2.5) });
+    assert_eq!(second, FrameErrors { all: sum(2, 3.5), moving: sum(1, 0.5) });
+    let mut both = first;
+    both.merge(second);
+    assert_eq!((both.all.mean(), both.moving.mean()), (Some(1.75), Some(1.5)));
+    assert_eq!(scores.report().all.endpoint.unwrap().mean, 1.75);
+    assert_eq!(ErrorSum::default().mean(), None);
+}
+
+#[test]
 fn nothing_has_no_figures() {
     let report = FieldScores::default().report();
     assert_eq!(report.all.endpoint, None);
@@ -65,6 +84,42 @@ fn nothing_has_no_figures() {
     assert_eq!(hidden.report(), report);
     hidden.add(&row(&[], &[], &[]), &row(&[], &[], &[]), &[], &[]);
     assert_eq!(hidden.report(), report);
+}
+
+#[test]
+fn nothing_is_counted_beyond_the_shortest_array() {
+    let whole = || row(&[1.0, 2.0, 3.0], &[true; 3], &[0.5; 3]);
+    let mut expected = FieldScores::default();
+    expected.add(&row(&[1.0], &[true], &[0.5]), &row(&[0.0], &[true], &[0.5]), &[true], &[false]);
+    let exact = || row(&[0.0; 3], &[true; 3], &[0.5; 3]);
+    for short in 0..7 {
+        let (mut tracks, mut truth, mut valid, mut moving) =
+            (whole(), exact(), vec![true; 3], vec![false; 3]);
+        match short {
+            0 => tracks.positions.truncate(1),
+            1 => tracks.visible.truncate(1),
+            2 => tracks.sigma.truncate(1),
+            3 => truth.positions.truncate(1),
+            4 => truth.visible.truncate(1),
+            5 => valid.truncate(1),
+            _ => moving.truncate(1),
+        }
+        let mut scores = FieldScores::default();
+        scores.add(&tracks, &truth, &valid, &moving);
+        assert_eq!(scores.report(), expected.report(), "{short}");
+    }
+    // The truth's own standard deviation is not asked for.
+    let mut scores = FieldScores::default();
+    scores.add(&row(&[1.0], &[true], &[0.5]), &row(&[0.0], &[true], &[]), &[true], &[false]);
+    assert_eq!(scores.report(), expected.report());
+}
+
+#[test]
+fn a_sigma_of_negative_zero_is_zero() {
+    let mut calibration = Calibration::default();
+    calibration.add([0.0, 1.0], std::hint::black_box(-0.0));
+    assert_eq!(calibration.overall(), Some([0.5, 0.5]));
+    assert!(calibration.deciles().iter().all(|decile| decile.from == 0.0));
 }
 
 #[test]
