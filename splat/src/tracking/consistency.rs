@@ -32,7 +32,9 @@ impl Judged {
 
     /// The standard deviation per axis to state for pixel `i`, pixels.
     pub(super) fn stated_sigma(&self, i: usize, floor: f32) -> f32 {
-        (floor * floor + self.sigma[i] * self.sigma[i] + self.alignment[i]).sqrt()
+        let speed = self.flow.u[i] * self.flow.u[i] + self.flow.v[i] * self.flow.v[i];
+        let interpolation = INTERPOLATION * speed / (speed + INTERPOLATED * INTERPOLATED);
+        (floor * floor + interpolation + self.sigma[i] * self.sigma[i] + self.alignment[i]).sqrt()
     }
 }
 
@@ -44,10 +46,11 @@ const NOISE: f32 = 6.0;
 const COLOUR_TOLERANCE: f32 = 24.0;
 
 // The variance of a track per axis is modelled as
-//     floor² + Σ r (TRIP e² + NOISE_SHARE n/λ) + DOUBT² d² + r ALIGNMENT L a²,
+//     floor² + m INTERPOLATION + Σ r (TRIP e² + NOISE_SHARE n/λ) + DOUBT² d² + r ALIGNMENT L a²,
 // with sums over the matches of its chain: e is the forward-backward error, n the mean squared residual of the window,
 // λ the smaller eigenvalue of the structure tensor; d is the distance to a candidate that disagrees (`chain`), a how far
-// the alignment with the key frame moves the track, L the number of matches; r < 1 where the flow is smooth as it rests.
+// the alignment with the key frame moves the track, L the number of matches; r < 1 where the flow
+// is smooth as it rests, m from 0 at rest to 1.
 // Fitted by quantile regression of the 68 % and the 95 % quantile of the errors on two clips; docs/tracking.md has the
 // procedure and the result by decile.
 
@@ -57,6 +60,10 @@ const TRIP: f32 = 0.177;
 const NOISE_SHARE: f32 = 0.0336;
 /// Power of the smoothness by which the variance of what rests is divided: neighbours share their noise.
 const REST_POWER: f32 = 0.65;
+/// Variance of what moves, as it is found between pixels, square pixels.
+const INTERPOLATION: f32 = 0.023 * 0.023;
+/// Displacement of which half counts as such, pixels: far more than noise makes of what rests.
+const INTERPOLATED: f32 = 0.5;
 /// Share of the squared distance that the alignment moves a track.
 const ALIGNMENT: f32 = 1.59;
 
@@ -176,7 +183,8 @@ pub(super) fn judge(
             let noise = agreement.residual[i].max(4.0);
             let squared_error = error[i] * error[i];
             let variance = TRIP * squared_error + NOISE_SHARE * noise / (first.texture[i] + 1e-3);
-            let variance = variance * share_at_rest((u * u + v * v).max(squared_error));
+            // What nothing is known of rests for no reason.
+            let variance = variance * share_at_rest((u * u + v * v).max(squared_error).max(variance));
             sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
         }
     }

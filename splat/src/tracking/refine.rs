@@ -25,8 +25,8 @@ const REST_SPEED: f32 = 0.05;
 
 /// How many times as smooth the flow is where its square is this.
 #[inline(always)]
-pub(super) fn rest(squared_speed: f32) -> f32 {
-    1.0 + REST / (1.0 + squared_speed * (1.0 / (REST_SPEED * REST_SPEED)))
+pub(super) fn rest(squared: f32) -> f32 {
+    1.0 + REST / (1.0 + squared * (1.0 / (REST_SPEED * REST_SPEED)))
 }
 
 /// How strongly and how long to smooth.

@@ -134,12 +134,12 @@ fn seeds_reach_what_descent_cannot_and_not_a_number_is_no_seed() {
 
 #[test]
 fn refinement_finds_a_known_affine_field() {
-    // The second image shows at A p + t what the first shows at p.
-    let truth = |x: f32, y: f32| [0.8 + 0.02 * x - 0.01 * y, -0.5 + 0.015 * x + 0.01 * y];
+    // The second image shows at A p + t what the first shows at p. Nothing rests: that would be smoothed more.
+    let truth = |x: f32, y: f32| [2.8 + 0.02 * x - 0.01 * y, -2.5 + 0.015 * x + 0.01 * y];
     let back = |x: f32, y: f32| {
         // Solves (1 + G) p = q - t for the field's gradient G.
         let (a, b, c, d) = (1.02f32, -0.01, 0.015, 1.01);
-        let (x, y, determinant) = (x - 0.8, y + 0.5, a * d - b * c);
+        let (x, y, determinant) = (x - 2.8, y + 2.5, a * d - b * c);
         [(d * x - b * y) / determinant, (a * y - c * x) / determinant]
     };
     let first = finest_level(&render(72, 56, waves));
