@@ -23,6 +23,7 @@ pub fn path() -> &'static Path {
         let folder = test.ancestors().nth(2).expect("tests lie in <profile>/deps");
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
         let mut build = Command::new(cargo);
+        without_package(&mut build);
         build.args(["build", "--quiet", "--package", "trackersplat"]).current_dir(workspace());
         if folder.ends_with("release") {
             build.arg("--release");
@@ -30,6 +31,17 @@ pub fn path() -> &'static Path {
         assert!(build.status().expect("cargo runs").success(), "the program builds");
         folder.join(format!("trackersplat{}", std::env::consts::EXE_SUFFIX))
     })
+}
+
+/// Takes away what cargo tells a test of its package: build scripts that watch these variables would run again, and what
+/// depends on them would be built again.
+fn without_package(command: &mut Command) {
+    for (name, _) in std::env::vars_os() {
+        let text = name.to_string_lossy();
+        if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+            command.env_remove(&name);
+        }
+    }
 }
 
 /// Root of the workspace.

@@ -43,9 +43,17 @@ fn announce(arguments: &[&str]) {
     println!("\n$ cargo {}", arguments.join(" "));
 }
 
-/// The cargo that runs this program.
+/// The cargo that runs this program, without what it tells this program of its package: build scripts that watch these
+/// variables would run again, here and when the tests build.
 pub(crate) fn cargo() -> Command {
-    Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
+    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    for (name, _) in std::env::vars_os() {
+        let text = name.to_string_lossy();
+        if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+            cargo.env_remove(&name);
+        }
+    }
+    cargo
 }
 
 /// Tests over all targets.
