@@ -62,7 +62,7 @@ pub struct TrackingSettings {
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
     #[serde(deserialize_with = "range::correlation")]
     pub correlation: f32,
-    /// Standard deviation that no track goes below, pixels; above 0, default 0.012.
+    /// Standard deviation that no track goes below, pixels; above 0, default 0.012, with `draft` 0.018.
     #[serde(deserialize_with = "range::distance")]
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
@@ -103,6 +103,7 @@ impl TrackingSettings {
         };
         match quality {
             Quality::Draft => Self {
+                sigma_floor: 0.018,
                 max_side: 400,
                 search_side: 80,
                 gaps: vec![1],

@@ -187,6 +187,23 @@ fn jumps_larger_than_the_object_are_followed_and_what_they_cover_is_hidden() {
 }
 
 #[test]
+fn what_moves_slowly_does_not_rest() {
+    // What rests is smoothed more; a tenth of a pixel per frame must not drown in the wall's rest.
+    let step = [0.1f32, -0.06];
+    let at = |t: usize| [70.0 + t as f32 * step[0], 40.0 + t as f32 * step[1]];
+    let frames: Vec<_> = (0..8).map(|t| noisy(&square_scene(at(t), 44.0), 0.01, 40 + t as u64)).collect();
+    let fields = track(&frames, &balanced());
+    let inside = |i: &usize| (78..106).contains(&(i % 192)) && (48..76).contains(&(i / 192));
+    for t in [1usize, 4, 7] {
+        let moved = [t as f32 * step[0], t as f32 * step[1]];
+        let errors = errors(&fields[t - 1], |at| [at[0] + moved[0], at[1] + moved[1]]);
+        let error = quantile((0..errors.len()).filter(inside).map(|i| errors[i]).collect(), 0.5);
+        // Noise of 2.5 grey levels: some hundredths, as for what moves fast.
+        assert!(error < 0.05, "frame {t}: {error}");
+    }
+}
+
+#[test]
 fn exposure_changes_are_not_motion() {
     let texture = Texture::new(5, 6.0);
     let key = render(96, 64, |x, y| texture.at(x, y));
