@@ -1,6 +1,9 @@
 //! Tracks that no connected worker may make: the coordinator makes them itself, under leases of its own.
 
-use std::sync::Arc;
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering::Relaxed},
+};
 
 use bytes::Bytes;
 use futures::future::try_join_all;
@@ -10,7 +13,10 @@ use splat::{
     settings::Settings,
     tracking::{TrackField, Tracker},
 };
-use tokio::{runtime::Handle, sync::OnceCell};
+use tokio::{
+    runtime::Handle,
+    sync::{Notify, OnceCell},
+};
 use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{self, TrackJob, TrackedField};
 
@@ -41,18 +47,34 @@ impl Job {
     async fn track_while_alone(&self) -> Result<(), StageError> {
         // One for all views: a network may be large.
         let tracker = OnceCell::new();
-        // Lanes are polled together: one that rests while it holds the desk would keep the others from it for ever.
-        let lanes = (0..self.hub.options.compute_threads.max(1)).map(|_| self.track_in_turn(&tracker));
-        try_join_all(lanes).await?;
+        let lanes = Lanes::default();
+        // Polled together: a lane that rests while it holds the desk would keep the others from it for ever.
+        let all = (0..self.hub.options.compute_threads.max(1)).map(|_| self.track_in_turn(&tracker, &lanes));
+        try_join_all(all).await?;
         Ok(())
     }
 
-    /// Tracks one view after the other until there is none for the coordinator.
-    async fn track_in_turn(&self, tracker: &OnceCell<Arc<Tracker>>) -> Result<(), StageError> {
-        while let Some((lease, request)) = self.hub.lease_own(&self.id, &self.stop).await? {
-            self.track_view(lease, request, tracker).await?;
+    /// Tracks one view after the other. A lane without a view waits while another has one: a worker that goes leaves
+    /// views behind.
+    async fn track_in_turn(&self, tracker: &OnceCell<Arc<Tracker>>, lanes: &Lanes) -> Result<(), StageError> {
+        let mut changed = self.changed.clone();
+        loop {
+            changed.borrow_and_update();
+            if let Some((lease, request)) = self.hub.lease_own(&self.id, &self.stop).await? {
+                lanes.busy.fetch_add(1, Relaxed);
+                self.track_view(lease, request, tracker).await?;
+                lanes.busy.fetch_sub(1, Relaxed);
+                lanes.ended.notify_waiters();
+                continue;
+            }
+            if lanes.busy.load(Relaxed) == 0 {
+                return Ok(());
+            }
+            tokio::select! {
+                () = lanes.ended.notified() => {}
+                woken = changed.changed() => woken.map_err(|_| StageError::Stopped)?,
+            }
         }
-        Ok(())
     }
 
     async fn track_view(
@@ -94,6 +116,13 @@ impl Job {
         };
         self.hub.compute.run(load).await
     }
+}
+
+/// What the lanes know of each other. They are polled by one task, so nothing happens between a look and a wait.
+#[derive(Default)]
+struct Lanes {
+    busy: AtomicUsize,
+    ended: Notify,
 }
 
 /// The tracks of one view. Runs on threads of the compute pool, where waiting is allowed.

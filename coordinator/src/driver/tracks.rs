@@ -135,6 +135,6 @@ impl Job {
         let source = self.track_file(position, view)?.digest.as_str();
         let clip = &self.record.clip_digest;
         let frames = &self.frames[..=index];
-        Ok(digest_of(&TrackKey { kind: "tracks", version: VERSION, source, clip, frames, view }))
+        Ok(digest_of(&TrackKey { kind: "imported tracks", version: VERSION, source, clip, frames, view }))
     }
 }

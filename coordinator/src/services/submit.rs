@@ -230,13 +230,15 @@ fn read(
     let training = clip.views().iter().enumerate().filter(|(_, view)| view.split == Split::Train);
     let (positions, names): (Vec<usize>, Vec<&str>) =
         training.map(|(position, view)| (position, view.name.as_str())).unzip();
-    if let TrackSource::Files(files) = &mut job_request.tracks {
+    let needs_tracks = settings.motion_source != MotionSource::None && clip.frames().len() > 1;
+    if let TrackSource::Files(files) = &mut job_request.tracks
+        && needs_tracks
+    {
         let all: Vec<&str> = clip.views().iter().map(|view| view.name.as_str()).collect();
         let of_views = files_by_view(files, &names, &all);
         let of_views = of_views.map_err(|error| Status::invalid_argument(format!("track files: {error}")))?;
         *files = of_views.into_iter().cloned().collect();
     }
-    let needs_tracks = settings.motion_source != MotionSource::None && clip.frames().len() > 1;
     if let TrackSource::Exact(files) = &mut job_request.tracks
         && needs_tracks
     {

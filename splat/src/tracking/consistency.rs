@@ -32,8 +32,8 @@ impl Judged {
 
     /// The standard deviation per axis to state for pixel `i`, pixels.
     pub(super) fn stated_sigma(&self, i: usize, floor: f32) -> f32 {
-        let speed = self.flow.u[i] * self.flow.u[i] + self.flow.v[i] * self.flow.v[i];
-        let interpolation = INTERPOLATION * speed / (speed + INTERPOLATED * INTERPOLATED);
+        let squared = self.flow.u[i] * self.flow.u[i] + self.flow.v[i] * self.flow.v[i];
+        let interpolation = INTERPOLATION * squared / (squared + INTERPOLATED * INTERPOLATED);
         (floor * floor + interpolation + self.sigma[i] * self.sigma[i] + self.alignment[i]).sqrt()
     }
 }
@@ -161,12 +161,14 @@ fn round_trip(flow: &Flow, back: &Flow) -> Vec<f32> {
     error
 }
 
-/// Judges the flow from `first` to `second` by the flow back and by what both frames show.
+/// Judges the flow from `first` to `second` by the flow back and by what both frames show; `smooths_rest` says whether
+/// neighbours that rest share their noise.
 pub(super) fn judge(
     first: &Frame,
     second: &Frame,
     flow: Flow,
     back: &Flow,
+    smooths_rest: bool,
     settings: &TrackingSettings,
 ) -> Judged {
     let error = round_trip(&flow, back);
@@ -184,7 +186,8 @@ pub(super) fn judge(
             let squared_error = error[i] * error[i];
             let variance = TRIP * squared_error + NOISE_SHARE * noise / (first.texture[i] + 1e-3);
             // What nothing is known of rests for no reason.
-            let variance = variance * share_at_rest((u * u + v * v).max(squared_error).max(variance));
+            let rests = (u * u + v * v).max(squared_error).max(variance);
+            let variance = if smooths_rest { variance * share_at_rest(rests) } else { variance };
             sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
         }
     }
@@ -215,7 +218,7 @@ pub(super) fn account_for_alignment(aligned: &mut Judged, before: &Flow) {
     for i in 0..aligned.alignment.len() {
         let moved = [aligned.flow.u[i] - before.u[i], aligned.flow.v[i] - before.v[i]];
         let squared = moved[0] * moved[0] + moved[1] * moved[1];
-        let speed = aligned.flow.u[i] * aligned.flow.u[i] + aligned.flow.v[i] * aligned.flow.v[i];
-        aligned.alignment[i] = ALIGNMENT * aligned.links[i] * squared * share_at_rest(speed.max(squared));
+        let displaced = aligned.flow.u[i] * aligned.flow.u[i] + aligned.flow.v[i] * aligned.flow.v[i];
+        aligned.alignment[i] = ALIGNMENT * aligned.links[i] * squared * share_at_rest(displaced.max(squared));
     }
 }

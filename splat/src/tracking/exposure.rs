@@ -13,11 +13,18 @@ const TO: f32 = 0.85;
 const PIXELS: usize = 1 << 12;
 /// Gains within this factor are left as they are: contents change too.
 const NOTHING: f32 = 1.1;
-/// Gains beyond this factor are not believed.
-const MOST: f32 = 8.0;
-/// Share of the squared difference that a gain may leave unexplained: what comes and goes in a scene changes some
-/// quantiles, exposure all of them alike.
+/// Gains beyond this factor are not believed: two stops.
+const MOST: f32 = 4.0;
+/// Share of the squared difference that a gain may leave unexplained.
 const UNEXPLAINED: f32 = 0.1;
+/// Quantiles that a gain may make worse: what comes and goes in a scene changes some of them, exposure all alike.
+const WORSE: usize = 3;
+/// What 8 bits do not tell apart.
+const STEP: f32 = 1.0 / 255.0;
+/// Luma from which a quantile may be clipped.
+const CLIPPED: f32 = 0.98;
+/// Quantiles that must be left for a gain to be believed.
+const LEAST: usize = QUANTILES / 2;
 
 /// How bright an image is.
 pub(super) struct Exposure {
@@ -27,7 +34,6 @@ pub(super) struct Exposure {
 impl Exposure {
     /// That of an image; values that are not finite count as 0.
     pub(super) fn of(image: &Image) -> Self {
-        // An odd step, so that it does not go along columns.
         let step = (image.pixel_count() / PIXELS) | 1;
         let luma = |&[red, green, blue]: &[f32; 3]| {
             let luma = 0.299 * red + 0.587 * green + 0.114 * blue;
@@ -46,19 +52,21 @@ impl Exposure {
     /// `image` times the gain that gives it this exposure; as it is if no gain explains the difference.
     pub(super) fn equalised<'a>(&self, image: &'a Image) -> Cow<'a, Image> {
         let Some(gain) = self.gain_of(&Self::of(image)) else { return Cow::Borrowed(image) };
-        let pixels = image.pixels.iter().map(|value| gain * value).collect();
+        // What a gain makes brighter than white was clipped in the key frame.
+        let pixels = image.pixels.iter().map(|&value| (gain * value).min(value.max(1.0))).collect();
         Cow::Owned(Image { pixels, ..*image })
     }
 
     fn gain_of(&self, other: &Self) -> Option<f32> {
-        let energy = |exposure: &Self| exposure.quantiles.iter().map(|value| value * value).sum::<f32>();
-        let gain = (energy(self) / energy(other)).sqrt();
-        let is_believed = (NOTHING..=MOST).contains(&gain.max(1.0 / gain));
-        let left = |gain: f32| -> f32 {
-            let pairs = self.quantiles.iter().zip(&other.quantiles);
-            pairs.map(|(ours, theirs)| (ours - gain * theirs).powi(2)).sum()
-        };
-        (is_believed && left(gain) < UNEXPLAINED * left(1.0)).then_some(gain)
+        let pairs = self.quantiles.into_iter().zip(other.quantiles);
+        let unclipped: Vec<(f32, f32)> = pairs.filter(|&(a, b)| a < CLIPPED && b < CLIPPED).collect();
+        let energy = |of: fn(&(f32, f32)) -> f32| unclipped.iter().map(|pair| of(pair).powi(2)).sum::<f32>();
+        let gain = (energy(|pair| pair.0) / energy(|pair| pair.1)).sqrt();
+        let is_credible = unclipped.len() >= LEAST && (NOTHING..=MOST).contains(&gain.max(1.0 / gain));
+        let off = |&(ours, theirs): &(f32, f32), gain: f32| (ours - gain * theirs).abs();
+        let left = |gain: f32| unclipped.iter().map(|pair| off(pair, gain).powi(2)).sum::<f32>();
+        let worse = unclipped.iter().filter(|pair| off(pair, gain) > off(pair, 1.0) + STEP).count();
+        (is_credible && left(gain) < UNEXPLAINED * left(1.0) && worse <= WORSE).then_some(gain)
     }
 }
 
@@ -77,11 +85,38 @@ mod tests {
     fn a_stop_more_or_less_is_taken_back() {
         let key = ramp(0.5, 0);
         let exposure = Exposure::of(&key);
-        for gain in [0.25f32, 0.4, 1.0, 3.0] {
+        for gain in [0.25f32, 0.4, 0.97] {
             let equal = exposure.equalised(&ramp(gain, 0)).into_owned();
             let off = equal.pixels.iter().zip(&key.pixels).map(|(a, b)| (a - b).abs());
             // Both gains are rounded.
             assert!(off.fold(0.0, f32::max) < 1e-6, "{gain}");
+        }
+    }
+
+    /// Someone bright in the dark, in so many columns of a hundred.
+    fn stage(columns: usize) -> Image {
+        let value = |i: usize| if i % 100 < columns { 0.45 + 0.003 * (i % 100) as f32 } else { 0.08 };
+        let pixels = (0..100 * 20).flat_map(|i| [value(i); 3]).collect();
+        Image { width: 100, height: 20, pixels }
+    }
+
+    #[test]
+    fn clipped_highlights_do_not_count() {
+        let key = ramp(0.6, 0);
+        let bright = Image {
+            pixels: ramp(1.2, 0).pixels.iter().map(|value| value.min(1.0)).collect(),
+            ..ramp(1.2, 0)
+        };
+        let equal = Exposure::of(&key).equalised(&bright).into_owned();
+        let darker = key.pixels.iter().zip(&equal.pixels).filter(|(key, _)| **key < 0.45);
+        assert!(darker.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) < 1e-3);
+    }
+
+    #[test]
+    fn someone_who_comes_near_in_the_dark_is_no_exposure() {
+        let exposure = Exposure::of(&stage(10));
+        for columns in [15, 25, 30, 35, 50, 70, 90] {
+            assert!(matches!(exposure.equalised(&stage(columns)), Cow::Borrowed(_)), "{columns}");
         }
     }
 

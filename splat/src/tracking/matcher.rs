@@ -20,6 +20,9 @@ pub(super) trait PairMatcher: Sync {
     /// Why it may fail.
     type Error;
 
+    /// Whether neighbours that rest share their noise, as the flow is smoothed there.
+    const SMOOTHS_REST: bool;
+
     /// The flow both ways; `guides` is what is known beforehand.
     fn both_ways(
         &self,
@@ -38,6 +41,8 @@ pub(super) struct PatchSearch;
 
 impl PairMatcher for PatchSearch {
     type Error = Infallible;
+
+    const SMOOTHS_REST: bool = true;
 
     fn both_ways(
         &self,

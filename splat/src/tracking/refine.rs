@@ -18,8 +18,9 @@ const SPECTRAL_RADIUS: f32 = 0.95;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
 const SHADING_RADIUS: usize = 4;
 
-/// How many times as smooth what rests is, and the displacement at which that is halved, pixels: cameras stand still, so
-/// most of what they see moves by nothing but noise.
+/// How much more what rests is smoothed, and the displacement at which that is halved, pixels: cameras stand still, so
+/// most of what they see moves by nothing but noise. With the differences above, equal neighbours at rest hold together a
+/// few thousand times as firmly as equal neighbours that move.
 const REST: f32 = 30.0;
 const REST_SPEED: f32 = 0.05;
 
@@ -266,11 +267,11 @@ fn link_kernel<S: Simd>(similarity: &[Vec<f32>; 2], flow: &Flow, weight: f32, eq
             let (du, dv) = (u[i] - other_u[i], v[i] - other_v[i]);
             let (here, there) =
                 (u[i] * u[i] + v[i] * v[i], other_u[i] * other_u[i] + other_v[i] * other_v[i]);
-            let speed = if here > there { here } else { there };
-            let scale =
-                DIFFERENCE_AT_REST * DIFFERENCE_AT_REST + DIFFERENCE_BY_MOTION * DIFFERENCE_BY_MOTION * speed;
+            let faster = if here > there { here } else { there };
+            let scale = DIFFERENCE_AT_REST * DIFFERENCE_AT_REST
+                + DIFFERENCE_BY_MOTION * DIFFERENCE_BY_MOTION * faster;
             let scale = scale.min(DIFFERENCE_AT_MOST * DIFFERENCE_AT_MOST);
-            links[i] = rest(speed) * weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
+            links[i] = rest(faster) * weight * similarity[i] / (du * du + dv * dv + scale).sqrt();
         }
     }
     let equations = &mut *equations;

@@ -212,8 +212,8 @@ fn exposure_changes_are_not_motion() {
     let errors = errors(&field, |at| [at[0] + 2.0, at[1] - 1.0]);
     assert!(fraction(field.visible.iter().copied()) > 0.85);
     let seen = errors.iter().zip(&field.visible).filter(|(_, visible)| **visible).map(|(error, _)| *error);
-    // Windows are compared up to an offset, not up to a gain, so a quarter less light costs accuracy.
-    assert!(quantile(seen.collect(), 0.9) < 0.4);
+    // The gain is found from quantiles, which the offset disturbs.
+    assert!(quantile(seen.collect(), 0.9) < 0.25);
 }
 
 #[test]

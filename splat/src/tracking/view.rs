@@ -159,7 +159,8 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         let continue_from = |past: &Past| {
             let Ways { forward, backward } =
                 self.matcher.both_ways(&past.frame, frame, None, self.settings)?;
-            let onward = consistency::judge(&past.frame, frame, forward, &backward, self.settings);
+            let onward =
+                consistency::judge(&past.frame, frame, forward, &backward, M::SMOOTHS_REST, self.settings);
             let mut chained = chain::chain(&past.tracks, &onward);
             consistency::recheck(&self.key, frame, &mut chained, self.settings);
             Ok(chained)
@@ -175,7 +176,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
             _ => None,
         };
         let Ways { forward, backward } = self.matcher.both_ways(&self.key, frame, guides, self.settings)?;
-        Ok(consistency::judge(&self.key, frame, forward, &backward, self.settings))
+        Ok(consistency::judge(&self.key, frame, forward, &backward, M::SMOOTHS_REST, self.settings))
     }
 
     /// The tracks, refined once more against the key frame itself.
