@@ -86,7 +86,11 @@ impl ClipInput {
         let (start, origins) = match (method.lift(), tracks) {
             (Some(lift), Some(tracks)) => {
                 let motion_settings = MotionSettings { lift, ..settings.motion.clone() };
-                let views = self.motion_views(tracks, index)?;
+                let mut views = self.motion_views(tracks, index)?;
+                for view in &mut views {
+                    let least = settings.motion.least_track_sigma;
+                    view.tracks = Arc::new(motion::no_surer_than(&view.tracks, least));
+                }
                 let field = motion::estimate(&engine, &self.static_model, &views, &motion_settings)?;
                 (motion::apply(&self.static_model, &field), shares(&field.origin))
             }

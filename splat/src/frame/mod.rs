@@ -228,10 +228,14 @@ fn compensate(engine: &dyn Engine, input: &FrameInput) -> Result<Start, FrameErr
         .training_views
         .iter()
         .filter_map(|view| {
-            let tracks = view.tracks.clone()?;
+            let tracks = view.tracks.as_ref()?;
+            let tracks = motion::no_surer_than(tracks, input.settings.motion.least_track_sigma);
             let mask = view.mask.as_ref().filter(|_| input.settings.masks == MaskUse::Train);
-            let tracks = mask.map_or(tracks.clone(), |mask| Arc::new(motion::within_mask(&tracks, mask)));
-            Some(MotionView { camera: view.camera.clone(), tracks })
+            let tracks = match mask {
+                Some(mask) => motion::within_mask(&tracks, mask),
+                None => tracks,
+            };
+            Some(MotionView { camera: view.camera.clone(), tracks: Arc::new(tracks) })
         })
         .collect();
     if input.is_key_frame || views.is_empty() || input.settings.motion_source == MotionSource::None {

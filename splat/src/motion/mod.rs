@@ -43,7 +43,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use apply::apply;
-pub use observe::within_mask;
+pub use observe::{no_surer_than, within_mask};
 pub use order::OrderCounts;
 pub use settings::{LiftMethod, MotionSettings};
 

@@ -108,6 +108,17 @@ pub fn within_mask(tracks: &TrackField, mask: &Mask) -> TrackField {
     tracks
 }
 
+/// The tracks, none of them surer than a standard deviation in pixels. Pixels count by the inverse of their variance: where
+/// a footprint shows what rests and what moves, the rest is known ten times as well, and would hold what moves.
+pub fn no_surer_than(tracks: &TrackField, least: f64) -> TrackField {
+    let mut tracks = tracks.clone();
+    for sigma in &mut tracks.sigma {
+        // What is not a number stays none.
+        *sigma = if f64::from(*sigma) < least { least as f32 } else { *sigma };
+    }
+    tracks
+}
+
 fn observation(
     gaussians: &Gaussians,
     index: usize,

@@ -60,6 +60,10 @@ pub struct MotionSettings {
     /// match on after densification.
     #[serde(deserialize_with = "range::magnitude")]
     pub noise_correlation_area: f64,
+    /// Standard deviation, px, that no track counts as surer than when a frame is moved; default 0.1. Surer ones would drag
+    /// the others of their footprint along.
+    #[serde(deserialize_with = "range::magnitude")]
+    pub least_track_sigma: f64,
     /// Standard deviation, px, of what no track sees: mixed surfaces and pixel rounding; default 0.05.
     #[serde(deserialize_with = "range::magnitude")]
     pub noise_floor: f64,
@@ -153,6 +157,7 @@ impl MotionSettings {
             reweighting_passes: if is_draft { 1 } else { 3 },
             expected_strain: 0.3,
             noise_correlation_area: 16.0,
+            least_track_sigma: 0.1,
             noise_floor: 0.05,
             static_floor: 0.2,
             static_significance: 3.0,

@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{
     super::{
         fit2d::{self, Fit},
+        no_surer_than,
         order::Order,
         within_mask,
     },
@@ -267,6 +268,18 @@ fn orders_are_counted() {
     let all = turning.r#static + turning.translation + turning.similarity + turning.affine;
     assert_eq!(all, resting.r#static);
     assert!(turning.affine + turning.similarity > all / 2, "{turning:?}");
+}
+
+#[test]
+fn no_track_counts_as_surer_than_it_may() {
+    let sigma = vec![0.01, 0.1, 3.0, 0.0, f32::NAN, f32::INFINITY];
+    let field =
+        TrackField { width: 6, height: 1, positions: vec![[0.5; 2]; 6], visible: vec![true; 6], sigma };
+    let found = no_surer_than(&field, 0.1);
+    assert_eq!(found.sigma[..4], [0.1, 0.1, 3.0, 0.1]);
+    assert!(found.sigma[4].is_nan() && found.sigma[5] == f32::INFINITY);
+    assert_eq!((&found.positions, &found.visible), (&field.positions, &field.visible));
+    assert_eq!(no_surer_than(&field, 0.0).sigma[..4], field.sigma[..4]);
 }
 
 #[test]
