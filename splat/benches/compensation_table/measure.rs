@@ -1,6 +1,6 @@
 //! Compensates a frame, refines it, and looks at what was held out.
 
-use std::ops::ControlFlow;
+use std::{ops::ControlFlow, sync::Arc};
 
 use anyhow::{Context, Result};
 use serde::Serialize;
