@@ -89,35 +89,33 @@ impl Settings {
 
 /// Ranges of settings, checked wherever settings are read.
 pub(crate) mod range {
+    use std::fmt::Display;
+
     use serde::{Deserialize, Deserializer, de::Error};
+
+    fn between<T: PartialOrd + Display, E: Error>(value: T, least: T, most: T) -> Result<T, E> {
+        // False for what is not a number.
+        if least <= value && value <= most {
+            return Ok(value);
+        }
+        Err(E::custom(format!("{value} is not between {least} and {most}")))
+    }
 
     /// A share or a rate: 0 to 1.
     pub(crate) fn unit<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
-        let value = f32::deserialize(from)?;
-        if (0.0..=1.0).contains(&value) {
-            return Ok(value);
-        }
-        Err(D::Error::custom(format!("{value} is not between 0 and 1")))
+        between(f32::deserialize(from)?, 0.0, 1.0)
     }
 
     /// A whole number within bounds.
     pub(crate) fn whole<'de, const LEAST: u32, const MOST: u32, D: Deserializer<'de>>(
         from: D,
     ) -> Result<u32, D::Error> {
-        let value = u32::deserialize(from)?;
-        if (LEAST..=MOST).contains(&value) {
-            return Ok(value);
-        }
-        Err(D::Error::custom(format!("{value} is not between {LEAST} and {MOST}")))
+        between(u32::deserialize(from)?, LEAST, MOST)
     }
 
     /// A correlation: -1 to 1.
     pub(crate) fn correlation<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
-        let value = f32::deserialize(from)?;
-        if (-1.0..=1.0).contains(&value) {
-            return Ok(value);
-        }
-        Err(D::Error::custom(format!("{value} is not between -1 and 1")))
+        between(f32::deserialize(from)?, -1.0, 1.0)
     }
 
     /// A distance in pixels: above 0, to a million.
@@ -131,11 +129,7 @@ pub(crate) mod range {
 
     /// A weight against another: 0 to a million.
     pub(crate) fn weight<'de, D: Deserializer<'de>>(from: D) -> Result<f32, D::Error> {
-        let value = f32::deserialize(from)?;
-        if (0.0..=1e6).contains(&value) {
-            return Ok(value);
-        }
-        Err(D::Error::custom(format!("{value} is not between 0 and 1000000")))
+        between(f32::deserialize(from)?, 0.0, 1e6)
     }
 
     /// Distances between frames: up to 16, each 1 to 1000.
@@ -149,11 +143,7 @@ pub(crate) mod range {
 
     /// A share in double precision: 0 to 1.
     pub(crate) fn share<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
-        let value = f64::deserialize(from)?;
-        if (0.0..=1.0).contains(&value) {
-            return Ok(value);
-        }
-        Err(D::Error::custom(format!("{value} is not between 0 and 1")))
+        between(f64::deserialize(from)?, 0.0, 1.0)
     }
 
     /// A size, a deviation or a significance: 0 to 1e30.

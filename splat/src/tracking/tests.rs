@@ -261,6 +261,7 @@ fn what_half_a_turn_makes_of_a_frame_is_not_claimed_to_be_known() {
     // Patches are not turned: what is called visible, a pixel in eighteen, matches elsewhere by chance.
     let wrong = dishonest(&field, |at| [80.0 - at[0], 64.0 - at[1]]);
     assert!(wrong < 0.08, "{wrong}");
+    assert!(fraction(field.visible.iter().copied()) < 0.08);
 }
 
 #[test]
