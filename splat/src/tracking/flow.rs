@@ -58,6 +58,12 @@ impl Flow {
         out
     }
 
+    /// How much the displacements of each pixel and its eight neighbours differ: length of their ranges along both axes.
+    pub(super) fn contrast(&self) -> Vec<f32> {
+        let (along_x, along_y) = (ranges(&self.u, self.width), ranges(&self.v, self.width));
+        along_x.iter().zip(&along_y).map(|(x, y)| x.hypot(*y)).collect()
+    }
+
     /// Resolution of an image over that of a field that was found on it after halvings, each of which rounds up: a power
     /// of two, not the ratio of the sizes.
     pub(super) fn reduction(image: [usize; 2], field: [usize; 2]) -> f32 {
@@ -69,10 +75,54 @@ impl Flow {
     }
 }
 
+/// Largest minus smallest of each value and its eight neighbours.
+fn ranges(values: &[f32], width: usize) -> Vec<f32> {
+    let height = values.len() / width;
+    let around = |at: usize, size: usize| at.saturating_sub(1)..(at + 2).min(size);
+    let of_row = |i: usize| -> [f32; 2] {
+        let (row, x) = (i - i % width, i % width);
+        extremes(values[row..][around(x, width)].iter().map(|&value| [value; 2]))
+    };
+    let rows: Vec<[f32; 2]> = (0..values.len()).map(of_row).collect();
+    let range = |i: usize| {
+        let [least, most] = extremes(around(i / width, height).map(|y| rows[y * width + i % width]));
+        most - least
+    };
+    (0..values.len()).map(range).collect()
+}
+
+fn extremes(pairs: impl Iterator<Item = [f32; 2]>) -> [f32; 2] {
+    pairs.fold([f32::INFINITY, f32::NEG_INFINITY], |[least, most], [low, high]| {
+        [least.min(low), most.max(high)]
+    })
+}
+
 /// Least weight of a pixel that counts.
 const LEAST_WEIGHT: f32 = 0.05;
 
 /// Whether a place between the pixels that [`Flow::corners`] has given is seen: all that count are.
 pub(super) fn sees(corners: &[(usize, f32); 4], visible: &[bool]) -> bool {
     corners.iter().all(|&(corner, weight)| weight < LEAST_WEIGHT || visible[corner])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn contrast_is_the_extent_of_the_displacements_around_a_pixel() {
+        let mut flow = Flow::zeros(5, 4);
+        flow.u[5 + 1] = 3.0;
+        flow.v[2 * 5 + 2] = -4.0;
+        // A pixel sees both, one or none.
+        #[rustfmt::skip]
+        let exact = [
+            3.0, 3.0, 3.0, 0.0, 0.0,
+            3.0, 5.0, 5.0, 4.0, 0.0,
+            3.0, 5.0, 5.0, 4.0, 0.0,
+            0.0, 4.0, 4.0, 4.0, 0.0,
+        ];
+        assert_eq!(flow.contrast(), exact);
+        assert_eq!(Flow::zeros(1, 1).contrast(), [0.0]);
+    }
 }

@@ -10,7 +10,7 @@ use super::{
     flow::Flow,
     patches::{self, Guess, PatchField},
     planes::{Planes, pyramid},
-    refine::{Smoothing, refine},
+    refine::{SHADING_RADIUS, Smoothing, refine},
     texels::Texels,
 };
 use crate::{image::Image, simd::Instructions};
@@ -21,6 +21,7 @@ const EDGE_SCALE: f32 = 40.0;
 /// One level of a frame's pyramid.
 pub(super) struct Level<const C: usize> {
     pub(super) planes: Arc<Planes<C>>,
+    /// Its colours, and gradients without what shading may explain.
     pub(super) texels: Texels<C>,
     /// How alike each pixel is to its left and to its upper neighbour, 1 where equal; 0 where there is none.
     pub(super) similarity: [Vec<f32>; 2],
@@ -29,7 +30,8 @@ pub(super) struct Level<const C: usize> {
 impl<const C: usize> Level<C> {
     pub(super) fn pyramid(finest: Planes<C>, settings: &TrackingSettings) -> Vec<Self> {
         let level = |planes: Planes<C>| {
-            let texels = Texels::new(&planes);
+            // What shading takes from differences it takes from their derivatives.
+            let texels = Texels::new(&planes, &planes.high_passed(SHADING_RADIUS));
             let similarity = similarity(&planes);
             Self { planes: Arc::new(planes), texels, similarity }
         };

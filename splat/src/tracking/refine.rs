@@ -16,7 +16,7 @@ const HOLD: f32 = 1e-4;
 /// Spectral radius of the sweeps that their acceleration expects.
 const SPECTRAL_RADIUS: f32 = 0.95;
 /// Half side of the window whose mean residual is not counted: shading and exposure.
-const SHADING_RADIUS: usize = 4;
+pub(super) const SHADING_RADIUS: usize = 4;
 
 /// How much more what rests is smoothed, and the displacement at which that is halved, pixels: cameras stand still, so
 /// most of what they see moves by nothing but noise. With the differences above, equal neighbours at rest hold together a
@@ -90,7 +90,8 @@ pub(super) fn refine<const C: usize>(
     flow
 }
 
-/// What the target shows along the flow: difference from the reference, means removed, and gradients.
+/// What the target shows along the flow: difference from the reference and gradients, means removed from both: else
+/// every step falls short.
 struct Linearised<const C: usize> {
     residual: [Vec<f32>; C],
     along_x: [Vec<f32>; C],

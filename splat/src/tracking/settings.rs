@@ -62,7 +62,7 @@ pub struct TrackingSettings {
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
     #[serde(deserialize_with = "range::correlation")]
     pub correlation: f32,
-    /// Standard deviation that no track goes below, pixels; above 0, default 0.012, with `draft` 0.018.
+    /// Standard deviation that no track goes below, pixels; above 0, default 0.008, with `draft` 0.018.
     #[serde(deserialize_with = "range::distance")]
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
@@ -97,7 +97,7 @@ impl TrackingSettings {
             smoothing_iterations: 10,
             consistency: 1.5,
             correlation: 0.5,
-            sigma_floor: 0.012,
+            sigma_floor: 0.008,
             hidden_sigma: 16.0,
             onnx: OnnxSettings::default(),
         };

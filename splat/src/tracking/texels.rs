@@ -6,7 +6,7 @@ use crate::simd::{LANES, ROWS, Simd};
 /// Replicated pixels on every side: one to interpolate with, one more for positions a pixel outside.
 const BORDER: usize = 2;
 
-/// A pixel of a channel: value, central differences along x and y, nothing.
+/// A pixel of a channel: value, gradient along x and y, nothing.
 type Texel = [f32; ROWS];
 
 /// What a channel shows at [`LANES`] places: values, and gradients along x and y.
@@ -21,16 +21,19 @@ pub(super) struct Texels<const CHANNELS: usize> {
 }
 
 impl<const CHANNELS: usize> Texels<CHANNELS> {
-    pub(super) fn new(planes: &Planes<CHANNELS>) -> Self {
-        let (width, height) = (planes.width, planes.height);
+    /// Values of one image with the central differences of another of the same size.
+    pub(super) fn new(values: &Planes<CHANNELS>, sloped: &Planes<CHANNELS>) -> Self {
+        let (width, height) = (values.width, values.height);
         let stride = width + 2 * BORDER;
-        let channels = planes.channels.each_ref().map(|channel| {
+        let channels = std::array::from_fn(|c| {
             let mut texels = Vec::with_capacity(stride * (height + 2 * BORDER));
             for y in 0..height + 2 * BORDER {
-                let at = planes.index(0, y.saturating_sub(BORDER).min(height - 1));
-                let row = |from: usize| &channel[from..from + width];
-                let (centre, left, right) = (row(at), row(at - 1), row(at + 1));
-                let (above, below) = (row(at - planes.stride), row(at + planes.stride));
+                let y = y.saturating_sub(BORDER).min(height - 1);
+                let (at, first) = (sloped.index(0, y), values.index(0, y));
+                let row = |from: usize| &sloped.channels[c][from..from + width];
+                let (left, right) = (row(at - 1), row(at + 1));
+                let (above, below) = (row(at - sloped.stride), row(at + sloped.stride));
+                let centre = &values.channels[c][first..first + width];
                 let texel =
                     |x: usize| [centre[x], 0.5 * (right[x] - left[x]), 0.5 * (below[x] - above[x]), 0.0];
                 texels.extend([texel(0); BORDER]);

@@ -51,14 +51,18 @@ fn end_point_errors(flow: &DenseFlow, truth: impl Fn([f32; 2]) -> [f32; 2]) -> V
 #[test]
 fn samples_agree_with_double_precision_and_clamp_outside() {
     let planes = Planes::luma_of(&render(13, 9, |x, y| waves(3.0 * x, 5.0 * y)), 0);
-    let texels = Texels::new(&planes);
-    let value = |x: i64, y: i64| f64::from(planes.row(0, y.clamp(0, 8) as usize)[x.clamp(0, 12) as usize]);
+    let sloped = Planes::luma_of(&render(13, 9, |x, y| waves(2.0 * y, 4.0 * x)), 0);
+    let texels = Texels::new(&planes, &sloped);
+    let of = |planes: &Planes<1>, x: i64, y: i64| {
+        f64::from(planes.row(0, y.clamp(0, 8) as usize)[x.clamp(0, 12) as usize])
+    };
+    let slope = |x: i64, y: i64| of(&sloped, x, y);
     let quantities = |x: i64, y: i64| {
         // The border replicates gradients too.
         let (x, y) = (x.clamp(0, 12), y.clamp(0, 8));
-        let along_x = 0.5 * (value(x + 1, y) - value(x - 1, y));
-        let along_y = 0.5 * (value(x, y + 1) - value(x, y - 1));
-        [value(x, y), along_x, along_y]
+        let along_x = 0.5 * (slope(x + 1, y) - slope(x - 1, y));
+        let along_y = 0.5 * (slope(x, y + 1) - slope(x, y - 1));
+        [of(&planes, x, y), along_x, along_y]
     };
     for (x, y) in [(0.0f32, 0.0f32), (3.25, 4.75), (11.9, 8.0), (-1.0, 9.0), (13.0, -1.0), (6.5, 0.125)] {
         let (column, row) = (f64::from(x).floor(), f64::from(y).floor());
