@@ -164,9 +164,10 @@ fn refinement_finds_a_known_affine_field() {
         let [u, v] = truth((i % 72) as f32 + 0.5, (i / 72) as f32 + 0.5);
         (refined.u[i] - u).hypot(refined.v[i] - v)
     });
-    // Half a pixel off at the start, as neighbouring patches are: to and fro. The sweeps are too few to forget all of it, let alone to move a field as a whole.
+    // Half a pixel off at the start, as neighbouring patches are: to and fro. The sweeps are too few to forget all of it, let
+    // alone to move a field as a whole; bilinear interpolation of the waves errs by a few hundredths.
     let error = quantile(errors.collect(), 0.9);
-    assert!(error < 0.15, "{error}");
+    assert!(error < 0.05, "{error}");
 }
 
 #[test]
