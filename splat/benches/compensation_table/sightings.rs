@@ -1,0 +1,229 @@
+//! How often a view's tracks mislead it about a Gaussian, and what the lift, which sees all views, makes of it.
+
+use std::sync::Arc;
+
+use anyhow::Result;
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+use splat::{
+    cameras::Camera,
+    clip::Split,
+    formats::track_npz,
+    gaussians::Gaussians,
+    motion::{
+        self, MotionField, MotionOrigin, MotionView,
+        sightings::{Seen, Sightings, Verdict},
+    },
+    raster::CpuEngine,
+    settings::Settings,
+};
+
+use super::{Tracks, clip::ClipInput};
+
+/// A sighting off by more than this is what the oracle drops, pixels.
+const WRONG: f64 = 2.0;
+/// Displacement in some view from which a Gaussian moves, pixels.
+const MOVING: f64 = 1.0;
+/// Views that must agree on the exact place of a Gaussian for it to be known.
+const SURE: usize = 3;
+/// Most Gauss-Newton steps of the plain fit.
+const STEPS: usize = 20;
+
+/// Ways to a position; the index of their errors.
+pub(crate) const WAYS: [&str; 5] =
+    ["least squares", "lift", "lift, oracle", "with neighbours", "with neighbours, oracle"];
+
+/// One view's sighting by own tracks, held against the one by exact tracks.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Judged {
+    /// Distance of the two, pixels.
+    pub(crate) error: f64,
+    /// What it claims to err by, standard deviation per axis, pixels.
+    pub(crate) deviation: f64,
+    pub(crate) is_believed: bool,
+    /// Whether the lift believes the exact one: its footprint shows the Gaussian, not another surface.
+    pub(crate) is_own_surface: bool,
+    /// Distance of the lift's place, in this view, from the exact sighting, pixels.
+    pub(crate) place_error: Option<f64>,
+}
+
+/// One Gaussian at one frame.
+#[derive(Clone, Debug)]
+pub(crate) struct Record {
+    pub(crate) is_moving: bool,
+    /// Views that see it, by own tracks.
+    pub(crate) views: usize,
+    /// Of these, those that exact tracks know too.
+    pub(crate) judged: Vec<Judged>,
+    /// Whether the lift found a position without help of neighbours.
+    pub(crate) is_decided: bool,
+    /// Mean distance of the position, projected to the views, from the exact one, pixels, by [`WAYS`]; absent where the exact
+    /// one is not known, or where a way leads nowhere.
+    pub(crate) errors: Option<[Option<f64>; WAYS.len()]>,
+}
+
+/// One frame: every Gaussian that some view sees by own tracks, and PSNR of the moving region before refinement, dB.
+pub(crate) struct Frame {
+    pub(crate) records: Vec<Record>,
+    /// With own tracks.
+    pub(crate) psnr: Option<f64>,
+    /// With the oracle.
+    pub(crate) oracle_psnr: Option<f64>,
+}
+
+impl ClipInput {
+    /// What the views see at frame number `frame`.
+    pub(crate) fn sightings(&self, frame: u32, settings: &Settings) -> Result<Frame> {
+        let index = frame as usize - 1;
+        let engine = CpuEngine::default();
+        let scene = &self.static_model;
+        let least = settings.motion.least_track_sigma;
+        let (mut own_views, mut exact_views) =
+            (self.motion_views(Tracks::Own, index)?, self.whole_exact_views(index)?);
+        for view in own_views.iter_mut().chain(&mut exact_views) {
+            view.tracks = Arc::new(motion::no_surer_than(&view.tracks, least));
+        }
+        let own = Sightings::gather(&engine, scene, &own_views, &settings.motion)?;
+        let exact = Sightings::gather(&engine, scene, &exact_views, &settings.motion)?;
+        let trial = Trial { scene, own, exact, cameras: own_views.iter().map(|view| &view.camera).collect() };
+
+        let with_all = trial.own.field(|_, _| true)?;
+        let with_right = trial.own.field(|gaussian, view| trial.is_right(gaussian, view))?;
+        let psnr = |field: &MotionField| -> Result<Option<f64>> {
+            let moved = motion::apply(scene, field);
+            Ok(self.quality(&engine, &moved, index, 0, settings)?.moving_psnr)
+        };
+        Ok(Frame {
+            psnr: psnr(&with_all)?,
+            oracle_psnr: psnr(&with_right)?,
+            records: (0..scene.len())
+                .into_par_iter()
+                .filter_map(|gaussian| {
+                    let moved = [&with_all, &with_right].map(|field| field.translation[gaussian]);
+                    trial.record(gaussian, moved)
+                })
+                .collect(),
+        })
+    }
+
+    /// Exact tracks that are known where they are hidden too: what a sighting is held against is where the surface goes.
+    fn whole_exact_views(&self, frame: usize) -> Result<Vec<MotionView>> {
+        let mut views = self.motion_views(Tracks::Exact, frame)?;
+        for (view, index) in views.iter_mut().zip(self.views(Split::Train)) {
+            let tracks = Arc::make_mut(&mut view.tracks);
+            let file = self.clip.exact_flow_path(index);
+            tracks.visible = track_npz::read_exact_validity(&file, tracks.width, tracks.height)?;
+        }
+        Ok(views)
+    }
+}
+
+struct Trial<'a> {
+    scene: &'a Gaussians,
+    own: Sightings<'a>,
+    exact: Sightings<'a>,
+    cameras: Vec<&'a Camera>,
+}
+
+impl Trial<'_> {
+    /// What the oracle keeps.
+    fn is_right(&self, gaussian: usize, view: usize) -> bool {
+        let in_view = |of: &Sightings<'_>| of.of(gaussian).find(|seen| seen.view == view);
+        let both = in_view(&self.own).zip(in_view(&self.exact));
+        both.is_some_and(|(own, exact)| own.pixel.distance(exact.pixel) <= WRONG)
+    }
+
+    /// `None` where no view sees the Gaussian. `moved` are its motions by the whole of compensation, without and with the oracle.
+    fn record(&self, gaussian: usize, moved: [DVec3; 2]) -> Option<Record> {
+        let mean = self.scene.mean(gaussian);
+        let seen: Vec<Seen> = self.own.of(gaussian).collect();
+        if seen.is_empty() {
+            return None;
+        }
+        let exact_seen: Vec<Seen> = self.exact.of(gaussian).collect();
+        let (own, exact) = (self.own.verdict(gaussian, |_| true), self.exact.verdict(gaussian, |_| true));
+        let is_believed = |verdict: &Option<Verdict>, view: usize| {
+            verdict.as_ref().is_some_and(|verdict| verdict.believed.contains(&view))
+        };
+        let judged = seen.iter().filter_map(|seen| {
+            let exactly = exact_seen.iter().find(|exact| exact.view == seen.view)?.pixel;
+            let place = own.as_ref().map(|own| mean + own.translation);
+            let place = place.and_then(|place| self.cameras[seen.view].project_world(place));
+            Some(Judged {
+                error: exactly.distance(seen.pixel),
+                deviation: seen.deviation,
+                is_believed: is_believed(&own, seen.view),
+                is_own_surface: is_believed(&exact, seen.view),
+                place_error: place.map(|place| place.distance(exactly)),
+            })
+        });
+        let displacement =
+            |seen: &Seen| Some(seen.pixel.distance(self.cameras[seen.view].project_world(mean)?));
+        let is_decided = |verdict: &Verdict| verdict.origin != MotionOrigin::Unsolved;
+        let is_sure = |verdict: &Verdict| is_decided(verdict) && verdict.believed.len() >= SURE;
+        Some(Record {
+            is_moving: exact_seen.iter().filter_map(displacement).any(|pixels| pixels > MOVING),
+            views: seen.len(),
+            judged: judged.collect(),
+            errors: exact.filter(is_sure).map(|exact| {
+                let oracle = self.own.verdict(gaussian, |view| self.is_right(gaussian, view));
+                let alone = |verdict: Option<&Verdict>| Some(mean + verdict.filter(|v| is_decided(v))?.translation);
+                let places = [
+                    Some(least_squares(mean, &seen, &self.cameras)),
+                    alone(own.as_ref()),
+                    alone(oracle.as_ref()),
+                    Some(mean + moved[0]),
+                    Some(mean + moved[1]),
+                ];
+                places.map(|place| distance(place?, mean + exact.translation, &seen, &self.cameras))
+            }),
+            is_decided: own.as_ref().is_some_and(is_decided),
+        })
+    }
+}
+
+/// Mean distance of two places in the views that see the Gaussian, pixels.
+fn distance(place: DVec3, truth: DVec3, seen: &[Seen], cameras: &[&Camera]) -> Option<f64> {
+    let in_view = |seen: &Seen| {
+        let camera = cameras[seen.view];
+        Some(camera.project_world(place)?.distance(camera.project_world(truth)?))
+    };
+    let distances: Vec<f64> = seen.iter().filter_map(in_view).collect();
+    (!distances.is_empty()).then(|| distances.iter().sum::<f64>() / distances.len() as f64)
+}
+
+/// The place that all sightings together are closest to, each by its claim: what a lift that trusts every view finds. The
+/// prior of the lift decides what no view sees.
+fn least_squares(mean: DVec3, seen: &[Seen], cameras: &[&Camera]) -> DVec3 {
+    let depth = seen.iter().map(|seen| cameras[seen.view].to_camera(mean).z).fold(0.0, f64::max);
+    let ridge = DMat3::from_diagonal(DVec3::splat(1e-2 / depth.powi(2)));
+    let cost = |place: DVec3| -> f64 {
+        let square = |seen: &Seen| {
+            let residual = cameras[seen.view].project_world(place).map(|at| seen.pixel - at);
+            residual.map_or(f64::INFINITY, |r| r.length_squared() / seen.deviation.powi(2))
+        };
+        seen.iter().map(square).sum()
+    };
+    let mut place = mean;
+    for _ in 0..STEPS {
+        let (mut normal, mut gradient) = (ridge, DVec3::ZERO);
+        for seen in seen {
+            let camera = cameras[seen.view];
+            let Some(at) = camera.project_world(place) else { return place };
+            let (residual, weight) = (seen.pixel - at, seen.deviation.powi(-2));
+            let [u, v] = camera.world_jacobian(camera.to_camera(place));
+            normal += (outer(u) + outer(v)) * weight;
+            gradient += (u * residual.x + v * residual.y) * weight;
+        }
+        let step = normal.inverse() * gradient;
+        let before = cost(place);
+        let shorter = (0..6).map(|halvings| place + step * 0.5f64.powi(halvings));
+        let Some(better) = shorter.into_iter().find(|&candidate| cost(candidate) < before) else { break };
+        place = better;
+    }
+    place
+}
+
+fn outer(a: DVec3) -> DMat3 {
+    DMat3::from_cols(a * a.x, a * a.y, a * a.z)
+}
