@@ -138,18 +138,21 @@ fn judge_sightings(
     settings: &Settings,
     machine: MachineLine,
 ) -> Result<()> {
-    let mut lines = Vec::new();
+    let (mut lines, mut psnr) = (Vec::new(), Vec::new());
     for name in &arguments.clip {
         let input = ClipInput::open(&folder.join(name), name, &arguments, settings)?;
-        let mut records = Vec::new();
+        let (mut records, mut by_frame) = (Vec::new(), Vec::new());
         for &frame in &arguments.frames {
-            let found = input.sightings(frame, settings)?;
-            records.extend(found.records);
-            eprintln!("{name}: frame {frame} is judged {:?} {:?}", found.psnr, found.oracle_psnr);
+            let judged = input.sightings(frame, settings)?;
+            records.extend(judged.records);
+            by_frame.extend(judged.psnr);
+            eprintln!("{name}: frame {frame} is judged: {:.2?} dB without and with the oracle", judged.psnr);
         }
         lines.extend(Line::all(name, &records));
+        let mean = |way: usize| by_frame.iter().map(|psnr| psnr[way]).sum::<f64>() / by_frame.len() as f64;
+        psnr.push((name.clone(), [mean(0), mean(1)]));
     }
-    let report = SightingsReport { machine, frames: arguments.frames, lines };
+    let report = SightingsReport { machine, frames: arguments.frames, psnr, lines };
     match arguments.json {
         true => println!("{}", serde_json::to_string_pretty(&report)?),
         false => println!("{}", report.tables()),

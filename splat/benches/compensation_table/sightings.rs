@@ -29,9 +29,10 @@ const SURE: usize = 3;
 /// Most Gauss-Newton steps of the plain fit.
 const STEPS: usize = 20;
 
-/// Ways to a position; the index of their errors.
-pub(crate) const WAYS: [&str; 5] =
-    ["least squares", "lift", "lift, oracle", "with neighbours", "with neighbours, oracle"];
+/// Ways to a position from a Gaussian's own views.
+pub(crate) const ALONE: [&str; 3] = ["least squares", "lift", "lift, oracle"];
+/// Ways to a position by the whole of compensation.
+pub(crate) const WHOLE: [&str; 2] = ["whole", "whole, oracle"];
 
 /// One view's sighting by own tracks, held against the one by exact tracks.
 #[derive(Clone, Copy, Debug)]
@@ -57,18 +58,19 @@ pub(crate) struct Record {
     pub(crate) judged: Vec<Judged>,
     /// Whether the lift found a position without help of neighbours.
     pub(crate) is_decided: bool,
-    /// Mean distance of the position, projected to the views, from the exact one, pixels, by [`WAYS`]; absent where the exact
-    /// one is not known, or where a way leads nowhere.
-    pub(crate) errors: Option<[Option<f64>; WAYS.len()]>,
+    /// Mean distance of the position, projected to the views, from the exact one, pixels, by [`ALONE`]; absent where the exact
+    /// one is not known, or where one of the ways needs the neighbours.
+    pub(crate) alone: Option<[f64; ALONE.len()]>,
+    /// The same by [`WHOLE`].
+    pub(crate) whole: Option<[f64; WHOLE.len()]>,
 }
 
-/// One frame: every Gaussian that some view sees by own tracks, and PSNR of the moving region before refinement, dB.
+/// One frame.
 pub(crate) struct Frame {
+    /// Every Gaussian that some view sees by own tracks.
     pub(crate) records: Vec<Record>,
-    /// With own tracks.
-    pub(crate) psnr: Option<f64>,
-    /// With the oracle.
-    pub(crate) oracle_psnr: Option<f64>,
+    /// PSNR of the moving region before refinement by [`WHOLE`], dB.
+    pub(crate) psnr: Option<[f64; WHOLE.len()]>,
 }
 
 impl ClipInput {
@@ -94,8 +96,7 @@ impl ClipInput {
             Ok(self.quality(&engine, &moved, index, 0, settings)?.moving_psnr)
         };
         Ok(Frame {
-            psnr: psnr(&with_all)?,
-            oracle_psnr: psnr(&with_right)?,
+            psnr: psnr(&with_all)?.zip(psnr(&with_right)?).map(<[f64; 2]>::from),
             records: (0..scene.len())
                 .into_par_iter()
                 .filter_map(|gaussian| {
@@ -161,23 +162,22 @@ impl Trial<'_> {
             |seen: &Seen| Some(seen.pixel.distance(self.cameras[seen.view].project_world(mean)?));
         let is_decided = |verdict: &Verdict| verdict.origin != MotionOrigin::Unsolved;
         let is_sure = |verdict: &Verdict| is_decided(verdict) && verdict.believed.len() >= SURE;
+        let truth = exact.as_ref().filter(|exact| is_sure(exact)).map(|exact| mean + exact.translation);
+        let error = |place: DVec3| distance(place, truth?, &seen, &self.cameras);
+        let alone = || {
+            let oracle = self.own.verdict(gaussian, |view| self.is_right(gaussian, view));
+            let [lift, oracle] =
+                [own.as_ref(), oracle.as_ref()].map(|verdict| verdict.filter(|v| is_decided(v)));
+            let plain = least_squares(mean, &seen, &self.cameras);
+            Some([error(plain)?, error(mean + lift?.translation)?, error(mean + oracle?.translation)?])
+        };
         Some(Record {
             is_moving: exact_seen.iter().filter_map(displacement).any(|pixels| pixels > MOVING),
             views: seen.len(),
             judged: judged.collect(),
-            errors: exact.filter(is_sure).map(|exact| {
-                let oracle = self.own.verdict(gaussian, |view| self.is_right(gaussian, view));
-                let alone = |verdict: Option<&Verdict>| Some(mean + verdict.filter(|v| is_decided(v))?.translation);
-                let places = [
-                    Some(least_squares(mean, &seen, &self.cameras)),
-                    alone(own.as_ref()),
-                    alone(oracle.as_ref()),
-                    Some(mean + moved[0]),
-                    Some(mean + moved[1]),
-                ];
-                places.map(|place| distance(place?, mean + exact.translation, &seen, &self.cameras))
-            }),
             is_decided: own.as_ref().is_some_and(is_decided),
+            alone: alone(),
+            whole: error(mean + moved[0]).zip(error(mean + moved[1])).map(<[f64; 2]>::from),
         })
     }
 }

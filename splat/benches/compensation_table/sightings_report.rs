@@ -1,11 +1,11 @@
-//! The table of sightings.
+//! The tables of sightings.
 
 use comfy_table::{CellAlignment, Table, presets::ASCII_MARKDOWN};
 use serde::Serialize;
 
 use super::{
     machine::MachineLine,
-    sightings::{Judged, Record, WAYS},
+    sightings::{ALONE, Judged, Record, WHOLE},
 };
 
 /// Errors from which a sighting is called wrong, pixels.
@@ -24,6 +24,9 @@ const VIEWS: [(usize, usize); 5] = [(1, usize::MAX), (1, 1), (2, 2), (3, 3), (4,
 pub(crate) struct SightingsReport {
     pub(crate) machine: MachineLine,
     pub(crate) frames: Vec<u32>,
+    /// PSNR of the moving region before refinement, mean over the frames, dB, by the whole of compensation without and with the
+    /// oracle; by clip.
+    pub(crate) psnr: Vec<(String, [f64; WHOLE.len()])>,
     pub(crate) lines: Vec<Line>,
 }
 
@@ -34,6 +37,17 @@ pub(crate) struct Wrong {
     pub(crate) share: Option<f64>,
     /// The share of them that the lift leaves out.
     pub(crate) left_out: Option<f64>,
+}
+
+/// Sightings that the lift believes although they are off by more than two pixels and three deviations.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct Missed {
+    /// Of all sightings.
+    pub(crate) share: Option<f64>,
+    /// Share of those missed of which the lift leaves out the exact one: the footprint shows another surface.
+    pub(crate) other_surface: Option<f64>,
+    /// Share of those missed of which it does not, and where the lift's place is wrong: the views agree on it.
+    pub(crate) wrong_place: Option<f64>,
 }
 
 /// Errors of one way to a position, pixels.
@@ -62,11 +76,13 @@ pub(crate) struct Line {
     pub(crate) wrong: Vec<Wrong>,
     /// Share left out of the sightings that are off by at most a pixel.
     pub(crate) false_alarms: Option<f64>,
-    /// The same of those of which the lift believes the exact one.
-    pub(crate) false_alarms_of_own_surface: Option<f64>,
-    /// Gaussians whose places are compared.
+    pub(crate) missed: Missed,
+    /// Gaussians that all ways of the views alone place.
+    pub(crate) placed_alone: usize,
+    /// Gaussians whose exact place is known.
     pub(crate) placed: usize,
-    pub(crate) places: Vec<Places>,
+    pub(crate) alone: Vec<Option<Places>>,
+    pub(crate) whole: Vec<Option<Places>>,
 }
 
 impl Line {
@@ -77,33 +93,29 @@ impl Line {
     }
 
     fn new(clip: &str, records: &[Record], is_moving: bool, views: (usize, usize)) -> Self {
-        let is_here = |record: &&Record| {
-            record.is_moving == is_moving && (views.0..=views.1).contains(&record.views)
-        };
+        let is_here =
+            |record: &&Record| record.is_moving == is_moving && (views.0..=views.1).contains(&record.views);
         let records: Vec<&Record> = records.iter().filter(is_here).collect();
         let judged: Vec<&Judged> = records.iter().flat_map(|record| &record.judged).collect();
-        let left_out = |of: &[&Judged]| share(of, |judged| !judged.is_believed);
-        let wrong = |is_wrong: &dyn Fn(&Judged) -> bool| {
-            let wrong: Vec<&Judged> = judged.iter().copied().filter(|judged| is_wrong(judged)).collect();
-            Wrong { share: share(&judged, |judged| is_wrong(judged)), left_out: left_out(&wrong) }
+        let that = |is: &dyn Fn(&Judged) -> bool| -> Vec<&Judged> {
+            judged.iter().copied().filter(|judged| is(judged)).collect()
         };
+        let left_out = |of: &[&Judged]| share(of, |judged| !judged.is_believed);
+        let wrong = |is_wrong: &dyn Fn(&Judged) -> bool| Wrong {
+            share: share(&judged, |judged| is_wrong(judged)),
+            left_out: left_out(&that(is_wrong)),
+        };
+        let is_beyond_claim = |judged: &Judged| judged.error > BEYOND_CLAIM * judged.deviation;
         let mut all_wrong: Vec<Wrong> = WRONG.iter().map(|&px| wrong(&|judged| judged.error > px)).collect();
-        all_wrong.push(wrong(&|judged| judged.error > BEYOND_CLAIM * judged.deviation));
-        let right: Vec<&Judged> = judged.iter().copied().filter(|judged| judged.error <= RIGHT).collect();
-        let own: Vec<&Judged> = right.iter().copied().filter(|judged| judged.is_own_surface).collect();
-        let errors: Vec<_> = records.iter().filter_map(|record| record.errors).collect();
-        let alone: Vec<_> = errors.iter().filter(|errors| errors[..3].iter().all(Option::is_some)).collect();
-        let places = WAYS.iter().enumerate().filter_map(|(way, name)| {
-            let found: Vec<f64> = if way < 3 { alone.iter().filter_map(|errors| errors[way]).collect() } else { errors.iter().filter_map(|errors| errors[way]).collect() };
-            places(name, found)
-        });
-        let missed: Vec<&Judged> = judged.iter().copied().filter(|j| j.error > 2.0 && j.error > 3.0 * j.deviation && j.is_believed).collect();
-        let confident = judged.iter().filter(|j| j.error > 2.0 && j.error > 3.0 * j.deviation).count();
-        let pct = |n: usize| 100.0 * n as f64 / missed.len().max(1) as f64;
-        let count = |f: &dyn Fn(&Judged) -> bool| missed.iter().filter(|j| f(j)).count();
-        eprintln!("{clip} {is_moving} {views:?}: confidently wrong {confident} of {}, missed {} ; of missed: other surface {:.1} %, own surface and place wrong {:.1} %, own surface and place right {:.1} %",
-            judged.len(), missed.len(), pct(count(&|j| !j.is_own_surface)),
-            pct(count(&|j| j.is_own_surface && j.place_error.is_none_or(|e| e > 2.0))), pct(count(&|j| j.is_own_surface && j.place_error.is_some_and(|e| e <= 2.0))));
+        all_wrong.push(wrong(&is_beyond_claim));
+        let is_missed =
+            |judged: &Judged| judged.is_believed && judged.error > WRONG_PLACE && is_beyond_claim(judged);
+        let missed = that(&is_missed);
+        let is_misplaced = |judged: &Judged| {
+            judged.is_own_surface && judged.place_error.is_none_or(|error| error > WRONG_PLACE)
+        };
+        let alone: Vec<_> = records.iter().filter_map(|record| record.alone).collect();
+        let whole: Vec<_> = records.iter().filter_map(|record| record.whole).collect();
         Self {
             clip: clip.to_owned(),
             is_moving,
@@ -112,10 +124,16 @@ impl Line {
             decided: share(&records, |record| record.is_decided),
             sightings: judged.len(),
             wrong: all_wrong,
-            false_alarms: left_out(&right),
-            false_alarms_of_own_surface: left_out(&own),
-            placed: errors.len(),
-            places: places.collect(),
+            false_alarms: left_out(&that(&|judged| judged.error <= RIGHT)),
+            missed: Missed {
+                share: share(&judged, |judged| is_missed(judged)),
+                other_surface: share(&missed, |judged| !judged.is_own_surface),
+                wrong_place: share(&missed, |judged| is_misplaced(judged)),
+            },
+            placed_alone: alone.len(),
+            placed: whole.len(),
+            alone: by_way(ALONE, &alone),
+            whole: by_way(WHOLE, &whole),
         }
     }
 
@@ -127,11 +145,37 @@ impl Line {
         };
         [self.clip.clone(), if self.is_moving { "move" } else { "rest" }.to_owned(), views]
     }
+
+    fn sightings_row(&self) -> Vec<String> {
+        let mut row = vec![self.gaussians.to_string(), percent(self.decided), self.sightings.to_string()];
+        row.extend(self.wrong.iter().flat_map(|wrong| [wrong.share, wrong.left_out]).map(percent));
+        let Missed { share, other_surface, wrong_place } = self.missed;
+        row.extend([self.false_alarms, share, other_surface, wrong_place].map(percent));
+        row
+    }
+
+    fn places_row(&self) -> Vec<String> {
+        let cells = |places: &Option<Places>| {
+            let pixels = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.3}"));
+            let [mean, ninth] = [places.map(|p| p.mean), places.map(|p| p.ninth_decile)].map(pixels);
+            [mean, ninth, percent(places.map(|p| p.wrong))]
+        };
+        let mut row = vec![self.placed_alone.to_string()];
+        row.extend(self.alone.iter().flat_map(cells));
+        row.push(self.placed.to_string());
+        row.extend(self.whole.iter().flat_map(cells));
+        row
+    }
 }
 
 fn share<T>(of: &[&T], is: impl Fn(&T) -> bool) -> Option<f64> {
     let count = of.iter().filter(|one| is(one)).count();
     (!of.is_empty()).then(|| count as f64 / of.len() as f64)
+}
+
+fn by_way<const N: usize>(ways: [&'static str; N], errors: &[[f64; N]]) -> Vec<Option<Places>> {
+    let of = |(index, way)| places(way, errors.iter().map(|errors| errors[index]).collect());
+    ways.into_iter().enumerate().map(of).collect()
 }
 
 fn places(way: &'static str, mut errors: Vec<f64>) -> Option<Places> {
@@ -146,60 +190,59 @@ fn places(way: &'static str, mut errors: Vec<f64>) -> Option<Places> {
 }
 
 impl SightingsReport {
-    /// Two tables: of sightings, of places.
+    /// Two tables, of sightings and of places, and what they come to.
     pub(crate) fn tables(&self) -> String {
-        let percent = |share: Option<f64>| share.map_or("-".into(), |share| format!("{:.2} %", 100.0 * share));
-        let names = ["clip", "Gaussians that", "views"];
         let sightings = [
-            "number", "decided", "sightings", "> 1 px", "left out", "> 2 px", "left out", "> 4 px", "left out", "> 3 σ",
-            "left out", "right, left out", "of own surface",
+            "number",
+            "decided",
+            "sightings",
+            "> 1 px",
+            "left out",
+            "> 2 px",
+            "left out",
+            "> 4 px",
+            "left out",
+            "> 3 σ",
+            "left out",
+            "right, left out",
+            "missed",
+            "other surface",
+            "place wrong",
         ];
-        let of_sightings = self.lines.iter().map(|line| {
-            let mut row =
-                vec![line.gaussians.to_string(), percent(line.decided), line.sightings.to_string()];
-            for wrong in &line.wrong {
-                row.extend([percent(wrong.share), percent(wrong.left_out)]);
-            }
-            row.extend([percent(line.false_alarms), percent(line.false_alarms_of_own_surface)]);
-            (line, row)
-        });
-        let mut header = vec!["placed".to_owned()];
-        for way in WAYS {
-            header.extend([format!("{way}: mean px"), "90 %".into(), "> 2 px".into()]);
-        }
-        let of_places = self.lines.iter().map(|line| {
-            let mut row = vec![line.placed.to_string()];
-            for places in &line.places {
-                row.extend([format!("{:.3}", places.mean), format!("{:.3}", places.ninth_decile)]);
-                row.push(percent(Some(places.wrong)));
-            }
-            (line, row)
+        let errors = |way: &str| [format!("{way}: mean px"), "90 %".into(), "> 2 px".into()];
+        let mut places = vec!["placed alone".to_owned()];
+        places.extend(ALONE.into_iter().flat_map(errors));
+        places.push("placed".into());
+        places.extend(WHOLE.into_iter().flat_map(errors));
+        let psnr = self.psnr.iter().map(|(clip, [own, oracle])| {
+            format!("{clip}: PSNR of the moving region before refinement {own:.2} dB, with the oracle {oracle:.2} dB")
         });
         format!(
             "{}\nFrames {:?}. Sightings by own tracks against those by exact ones; left out by the lift.\n\n{}\n\nPlaces, \
-             projected to the views.\n\n{}",
+             projected to the views, against those that exact tracks lead to.\n\n{}\n\n{}",
             self.machine,
             self.frames,
-            table(&names, &sightings.map(String::from), of_sightings),
-            table(&names, &header, of_places),
+            self.table(sightings.map(String::from).to_vec(), Line::sightings_row),
+            self.table(places, Line::places_row),
+            psnr.collect::<Vec<_>>().join("\n"),
         )
+    }
+
+    fn table(&self, header: Vec<String>, row: fn(&Line) -> Vec<String>) -> Table {
+        let names = ["clip", "Gaussians that", "views"].map(String::from);
+        let mut table = Table::new();
+        table.load_style(ASCII_MARKDOWN);
+        table.set_header(names.iter().cloned().chain(header));
+        for line in &self.lines {
+            table.add_row(line.name().into_iter().chain(row(line)));
+        }
+        for column in table.column_iter_mut().skip(names.len()) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+        table
     }
 }
 
-fn table<'a>(
-    names: &[&str],
-    header: &[String],
-    rows: impl Iterator<Item = (&'a Line, Vec<String>)>,
-) -> Table {
-    let mut table = Table::new();
-    table.load_style(ASCII_MARKDOWN);
-    table.set_header(names.iter().copied().map(String::from).chain(header.iter().cloned()));
-    for (line, mut row) in rows {
-        row.resize(header.len(), "-".into());
-        table.add_row(line.name().into_iter().chain(row));
-    }
-    for column in table.column_iter_mut().skip(names.len()) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
-    table
+fn percent(share: Option<f64>) -> String {
+    share.map_or("-".into(), |share| format!("{:.2} %", 100.0 * share))
 }
