@@ -22,7 +22,7 @@ use super::{Tracks, clip::ClipInput};
 
 /// A sighting off by more than this is what the oracle drops, pixels.
 const WRONG: f64 = 2.0;
-/// Displacement in some view from which a Gaussian moves, pixels.
+/// Mean displacement in the views from which a Gaussian moves, pixels.
 const MOVING: f64 = 1.0;
 /// Views that must agree on the exact place of a Gaussian for it to be known.
 const SURE: usize = 3;
@@ -34,32 +34,34 @@ pub(crate) const ALONE: [&str; 3] = ["least squares", "lift", "lift, oracle"];
 /// Ways to a position by the whole of compensation.
 pub(crate) const WHOLE: [&str; 2] = ["whole", "whole, oracle"];
 
-/// One view's sighting by own tracks, held against the one by exact tracks.
+/// One view's sighting by own tracks, of a Gaussian whose place is known from exact ones.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Judged {
-    /// Distance of the two, pixels.
+    /// Distance from the place, projected, pixels.
     pub(crate) error: f64,
     /// What it claims to err by, standard deviation per axis, pixels.
     pub(crate) deviation: f64,
     pub(crate) is_believed: bool,
-    /// Whether the lift believes the exact one: its footprint shows the Gaussian, not another surface.
-    pub(crate) is_own_surface: bool,
-    /// Distance of the lift's place, in this view, from the exact sighting, pixels.
-    pub(crate) place_error: Option<f64>,
+    /// Whether most of the Gaussian's sightings are right, so that a vote of the views can tell.
+    pub(crate) are_most_right: bool,
+    /// Whether the sighting by exact tracks is wrong too: its footprint shows another surface.
+    pub(crate) is_of_other_surface: bool,
+    /// Whether the place that the lift finds is wrong in this view.
+    pub(crate) is_misplaced: bool,
 }
 
-/// One Gaussian at one frame.
+/// One Gaussian at one frame whose place is known.
 #[derive(Clone, Debug)]
 pub(crate) struct Record {
     pub(crate) is_moving: bool,
     /// Views that see it, by own tracks.
     pub(crate) views: usize,
-    /// Of these, those that exact tracks know too.
+    /// What these see.
     pub(crate) judged: Vec<Judged>,
     /// Whether the lift found a position without help of neighbours.
     pub(crate) is_decided: bool,
-    /// Mean distance of the position, projected to the views, from the exact one, pixels, by [`ALONE`]; absent where the exact
-    /// one is not known, or where one of the ways needs the neighbours.
+    /// Mean distance of the position, projected to the views, from the place, pixels, by [`ALONE`]; absent where one of the
+    /// ways needs the neighbours.
     pub(crate) alone: Option<[f64; ALONE.len()]>,
     /// The same by [`WHOLE`].
     pub(crate) whole: Option<[f64; WHOLE.len()]>,
@@ -67,7 +69,7 @@ pub(crate) struct Record {
 
 /// One frame.
 pub(crate) struct Frame {
-    /// Every Gaussian that some view sees by own tracks.
+    /// Every Gaussian that some view sees by own tracks, and whose place is known.
     pub(crate) records: Vec<Record>,
     /// PSNR of the moving region before refinement by [`WHOLE`], dB.
     pub(crate) psnr: Option<[f64; WHOLE.len()]>,
@@ -87,10 +89,14 @@ impl ClipInput {
         }
         let own = Sightings::gather(&engine, scene, &own_views, &settings.motion)?;
         let exact = Sightings::gather(&engine, scene, &exact_views, &settings.motion)?;
-        let trial = Trial { scene, own, exact, cameras: own_views.iter().map(|view| &view.camera).collect() };
+        let cameras = own_views.iter().map(|view| &view.camera).collect();
+        let trial = Trial { scene, own, exact, cameras };
 
         let with_all = trial.own.field(|_, _| true)?;
-        let with_right = trial.own.field(|gaussian, view| trial.is_right(gaussian, view))?;
+        let places: Vec<Option<DVec3>> =
+            (0..scene.len()).into_par_iter().map(|gaussian| trial.place(gaussian)).collect();
+        let with_right =
+            trial.own.field(|gaussian, view| trial.is_right(gaussian, view, places[gaussian]))?;
         let psnr = |field: &MotionField| -> Result<Option<f64>> {
             let moved = motion::apply(scene, field);
             Ok(self.quality(&engine, &moved, index, 0, settings)?.moving_psnr)
@@ -101,7 +107,7 @@ impl ClipInput {
                 .into_par_iter()
                 .filter_map(|gaussian| {
                     let moved = [&with_all, &with_right].map(|field| field.translation[gaussian]);
-                    trial.record(gaussian, moved)
+                    trial.record(gaussian, places[gaussian]?, moved)
                 })
                 .collect(),
         })
@@ -127,59 +133,76 @@ struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// What the oracle keeps.
-    fn is_right(&self, gaussian: usize, view: usize) -> bool {
-        let in_view = |of: &Sightings<'_>| of.of(gaussian).find(|seen| seen.view == view);
-        let both = in_view(&self.own).zip(in_view(&self.exact));
-        both.is_some_and(|(own, exact)| own.pixel.distance(exact.pixel) <= WRONG)
+    /// Where exact tracks take a Gaussian, if enough views agree.
+    fn place(&self, gaussian: usize) -> Option<DVec3> {
+        let verdict = self.exact.verdict(gaussian, |_| true)?;
+        let is_sure = is_decided(&verdict) && verdict.believed.len() >= SURE;
+        is_sure.then_some(self.scene.mean(gaussian) + verdict.translation)
+    }
+
+    /// How far a view's sighting of a Gaussian is from its place, pixels.
+    fn error(&self, seen: &Seen, place: DVec3) -> Option<f64> {
+        Some(self.cameras[seen.view].project_world(place)?.distance(seen.pixel))
+    }
+
+    /// What the oracle keeps: of what is not known, everything.
+    fn is_right(&self, gaussian: usize, view: usize, place: Option<DVec3>) -> bool {
+        let Some(place) = place else { return true };
+        let seen = self.own.of(gaussian).find(|seen| seen.view == view);
+        seen.and_then(|seen| self.error(&seen, place)).is_some_and(|error| error <= WRONG)
     }
 
     /// `None` where no view sees the Gaussian. `moved` are its motions by the whole of compensation, without and with the oracle.
-    fn record(&self, gaussian: usize, moved: [DVec3; 2]) -> Option<Record> {
+    fn record(&self, gaussian: usize, place: DVec3, moved: [DVec3; 2]) -> Option<Record> {
         let mean = self.scene.mean(gaussian);
         let seen: Vec<Seen> = self.own.of(gaussian).collect();
         if seen.is_empty() {
             return None;
         }
-        let exact_seen: Vec<Seen> = self.exact.of(gaussian).collect();
-        let (own, exact) = (self.own.verdict(gaussian, |_| true), self.exact.verdict(gaussian, |_| true));
-        let is_believed = |verdict: &Option<Verdict>, view: usize| {
-            verdict.as_ref().is_some_and(|verdict| verdict.believed.contains(&view))
-        };
-        let judged = seen.iter().filter_map(|seen| {
-            let exactly = exact_seen.iter().find(|exact| exact.view == seen.view)?.pixel;
-            let place = own.as_ref().map(|own| mean + own.translation);
-            let place = place.and_then(|place| self.cameras[seen.view].project_world(place));
-            Some(Judged {
-                error: exactly.distance(seen.pixel),
-                deviation: seen.deviation,
-                is_believed: is_believed(&own, seen.view),
-                is_own_surface: is_believed(&exact, seen.view),
-                place_error: place.map(|place| place.distance(exactly)),
-            })
-        });
-        let displacement =
-            |seen: &Seen| Some(seen.pixel.distance(self.cameras[seen.view].project_world(mean)?));
-        let is_decided = |verdict: &Verdict| verdict.origin != MotionOrigin::Unsolved;
-        let is_sure = |verdict: &Verdict| is_decided(verdict) && verdict.believed.len() >= SURE;
-        let truth = exact.as_ref().filter(|exact| is_sure(exact)).map(|exact| mean + exact.translation);
-        let error = |place: DVec3| distance(place, truth?, &seen, &self.cameras);
+        let own = self.own.verdict(gaussian, |_| true);
+        let decided = own.as_ref().filter(|verdict| is_decided(verdict));
+        let error = |found: DVec3| distance(found, place, &seen, &self.cameras);
         let alone = || {
-            let oracle = self.own.verdict(gaussian, |view| self.is_right(gaussian, view));
-            let [lift, oracle] =
-                [own.as_ref(), oracle.as_ref()].map(|verdict| verdict.filter(|v| is_decided(v)));
+            let oracle = self.own.verdict(gaussian, |view| self.is_right(gaussian, view, Some(place)));
+            let oracle = oracle.filter(is_decided)?;
             let plain = least_squares(mean, &seen, &self.cameras);
-            Some([error(plain)?, error(mean + lift?.translation)?, error(mean + oracle?.translation)?])
+            Some([error(plain)?, error(mean + decided?.translation)?, error(mean + oracle.translation)?])
         };
         Some(Record {
-            is_moving: exact_seen.iter().filter_map(displacement).any(|pixels| pixels > MOVING),
+            is_moving: error(mean)? > MOVING,
             views: seen.len(),
-            judged: judged.collect(),
-            is_decided: own.as_ref().is_some_and(is_decided),
+            judged: self.judged(gaussian, &seen, own.as_ref(), place),
+            is_decided: decided.is_some(),
             alone: alone(),
             whole: error(mean + moved[0]).zip(error(mean + moved[1])).map(<[f64; 2]>::from),
         })
     }
+
+    fn judged(&self, gaussian: usize, seen: &[Seen], own: Option<&Verdict>, place: DVec3) -> Vec<Judged> {
+        let exact_seen: Vec<Seen> = self.exact.of(gaussian).collect();
+        let errors: Vec<Option<f64>> = seen.iter().map(|seen| self.error(seen, place)).collect();
+        let right = errors.iter().flatten().filter(|&&error| error <= WRONG).count();
+        let are_most_right = 2 * right > seen.len();
+        let found = own.map(|own| self.scene.mean(gaussian) + own.translation);
+        let judge = |(seen, error): (&Seen, &Option<f64>)| {
+            let exactly = exact_seen.iter().find(|exact| exact.view == seen.view);
+            let in_view = |place: DVec3| self.cameras[seen.view].project_world(place);
+            let misplaced = found.and_then(in_view).zip(in_view(place)).map(|(a, b)| a.distance(b));
+            Some(Judged {
+                error: (*error)?,
+                deviation: seen.deviation,
+                is_believed: own.is_some_and(|own| own.believed.contains(&seen.view)),
+                are_most_right,
+                is_of_other_surface: exactly.and_then(|exact| self.error(exact, place)) > Some(WRONG),
+                is_misplaced: misplaced > Some(WRONG),
+            })
+        };
+        seen.iter().zip(&errors).filter_map(judge).collect()
+    }
+}
+
+fn is_decided(verdict: &Verdict) -> bool {
+    verdict.origin != MotionOrigin::Unsolved
 }
 
 /// Mean distance of two places in the views that see the Gaussian, pixels.

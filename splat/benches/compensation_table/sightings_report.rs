@@ -44,9 +44,9 @@ pub(crate) struct Wrong {
 pub(crate) struct Missed {
     /// Of all sightings.
     pub(crate) share: Option<f64>,
-    /// Share of those missed of which the lift leaves out the exact one: the footprint shows another surface.
+    /// Share of those missed that are wrong by exact tracks too: their footprint shows another surface.
     pub(crate) other_surface: Option<f64>,
-    /// Share of those missed of which it does not, and where the lift's place is wrong: the views agree on it.
+    /// Share of those missed in whose view the lift's place is wrong.
     pub(crate) wrong_place: Option<f64>,
 }
 
@@ -74,6 +74,8 @@ pub(crate) struct Line {
     pub(crate) sightings: usize,
     /// Off by more than 1, 2, 4 pixels, and by more than three deviations.
     pub(crate) wrong: Vec<Wrong>,
+    /// Off by more than two pixels and three deviations, while most of the Gaussian's sightings are right.
+    pub(crate) outvoted: Wrong,
     /// Share left out of the sightings that are off by at most a pixel.
     pub(crate) false_alarms: Option<f64>,
     pub(crate) missed: Missed,
@@ -108,12 +110,9 @@ impl Line {
         let is_beyond_claim = |judged: &Judged| judged.error > BEYOND_CLAIM * judged.deviation;
         let mut all_wrong: Vec<Wrong> = WRONG.iter().map(|&px| wrong(&|judged| judged.error > px)).collect();
         all_wrong.push(wrong(&is_beyond_claim));
-        let is_missed =
-            |judged: &Judged| judged.is_believed && judged.error > WRONG_PLACE && is_beyond_claim(judged);
+        let is_surely_wrong = |judged: &Judged| judged.error > WRONG_PLACE && is_beyond_claim(judged);
+        let is_missed = |judged: &Judged| judged.is_believed && is_surely_wrong(judged);
         let missed = that(&is_missed);
-        let is_misplaced = |judged: &Judged| {
-            judged.is_own_surface && judged.place_error.is_none_or(|error| error > WRONG_PLACE)
-        };
         let alone: Vec<_> = records.iter().filter_map(|record| record.alone).collect();
         let whole: Vec<_> = records.iter().filter_map(|record| record.whole).collect();
         Self {
@@ -124,11 +123,12 @@ impl Line {
             decided: share(&records, |record| record.is_decided),
             sightings: judged.len(),
             wrong: all_wrong,
+            outvoted: wrong(&|judged| is_surely_wrong(judged) && judged.are_most_right),
             false_alarms: left_out(&that(&|judged| judged.error <= RIGHT)),
             missed: Missed {
                 share: share(&judged, |judged| is_missed(judged)),
-                other_surface: share(&missed, |judged| !judged.is_own_surface),
-                wrong_place: share(&missed, |judged| is_misplaced(judged)),
+                other_surface: share(&missed, |judged| judged.is_of_other_surface),
+                wrong_place: share(&missed, |judged| judged.is_misplaced),
             },
             placed_alone: alone.len(),
             placed: whole.len(),
@@ -148,7 +148,8 @@ impl Line {
 
     fn sightings_row(&self) -> Vec<String> {
         let mut row = vec![self.gaussians.to_string(), percent(self.decided), self.sightings.to_string()];
-        row.extend(self.wrong.iter().flat_map(|wrong| [wrong.share, wrong.left_out]).map(percent));
+        let wrong = self.wrong.iter().chain([&self.outvoted]);
+        row.extend(wrong.flat_map(|wrong| [wrong.share, wrong.left_out]).map(percent));
         let Missed { share, other_surface, wrong_place } = self.missed;
         row.extend([self.false_alarms, share, other_surface, wrong_place].map(percent));
         row
@@ -203,6 +204,8 @@ impl SightingsReport {
             "> 4 px",
             "left out",
             "> 3 σ",
+            "left out",
+            "> 2 px and 3 σ, most right",
             "left out",
             "right, left out",
             "missed",
