@@ -149,8 +149,11 @@ fn judge_sightings(
             eprintln!("{name}: frame {frame} is judged: {:.2?} dB without and with the oracle", judged.psnr);
         }
         lines.extend(Line::all(name, &records));
+        // Of a clip in which nothing moves there is none.
         let mean = |way: usize| by_frame.iter().map(|psnr| psnr[way]).sum::<f64>() / by_frame.len() as f64;
-        psnr.push((name.clone(), [mean(0), mean(1)]));
+        if !by_frame.is_empty() {
+            psnr.push((name.clone(), [mean(0), mean(1)]));
+        }
     }
     let report = SightingsReport { machine, frames: arguments.frames, psnr, lines };
     match arguments.json {
