@@ -40,7 +40,7 @@ pub(crate) enum Bench {
     /// code's, the robust one; `--help` has its options.
     #[command(disable_help_flag = true)]
     Compensation {
-        /// Passed on: --clips DIR, --clip NAMES, --frames, --iterations, --tracks, --quality, --static-models DIR, --json.
+        /// Passed on: --clips DIR, --clip NAMES, --frames, --iterations, --tracks, --quality, --static-models DIR, --sightings, --json.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<String>,
     },

@@ -127,7 +127,7 @@ impl ClipInput {
         Ok(refined.context("nobody stops the refinement")?.gaussians)
     }
 
-    fn quality(
+    pub(crate) fn quality(
         &self,
         engine: &dyn Engine,
         gaussians: &Gaussians,

@@ -12,6 +12,7 @@
 //! | motion of unobserved Gaussians from agreeing neighbours | `propagate` |
 //! | the neighbours' field as one sparse solve | `regularize` |
 //! | moving the Gaussians | `apply` |
+//! | what single views say and the lift believes, to measure | `sightings` |
 //! | the released code's own path, to compare with | `reference` |
 //! | an order that the input's order does not change | `value_order` |
 //!
@@ -32,6 +33,7 @@ mod regularize;
 pub mod reweighting;
 mod rotation;
 mod settings;
+pub mod sightings;
 mod static_test;
 mod strain;
 #[cfg(test)]
@@ -164,6 +166,16 @@ fn estimate_in_order(
 ) -> Result<MotionField, EngineError> {
     entered(MotionStage::Observe);
     let observations = observe::observe(engine, gaussians, views, settings)?;
+    estimate_observed(gaussians, &observations, views, settings, entered)
+}
+
+fn estimate_observed(
+    gaussians: &Gaussians,
+    observations: &[Vec<Observation>],
+    views: &[MotionView],
+    settings: &MotionSettings,
+    entered: &mut dyn FnMut(MotionStage),
+) -> Result<MotionField, EngineError> {
     entered(MotionStage::Neighbours);
     let neighbourhood = Neighbourhood::new(gaussians, settings)?;
     let context = Context { gaussians, neighbourhood: &neighbourhood, settings };
@@ -175,11 +187,11 @@ fn estimate_in_order(
         .collect();
     propagate::retract_unverified(&mut states, &context);
     entered(MotionStage::Turn);
-    turn_solved(&mut states, &observations, views, &context);
+    turn_solved(&mut states, observations, views, &context);
     entered(MotionStage::Propagate);
     propagate::propagate(&mut states, &context);
     if propagate::accept_doubted(&mut states) {
-        turn_solved(&mut states, &observations, views, &context);
+        turn_solved(&mut states, observations, views, &context);
         propagate::propagate(&mut states, &context);
     }
     if propagate::accept_resting(&mut states) {
@@ -187,7 +199,7 @@ fn estimate_in_order(
     }
     entered(MotionStage::Regularise);
     regularize::regularize(&mut states, &context);
-    Ok(field(&states, &observations, views, &context))
+    Ok(field(&states, observations, views, &context))
 }
 
 /// What a Gaussian's own footprints say about its translation.

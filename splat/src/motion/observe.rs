@@ -39,6 +39,7 @@ pub(super) fn observe(
 ) -> Result<Vec<Vec<Observation>>, EngineError> {
     let mut observations: Vec<Vec<Observation>> =
         (0..gaussians.len()).map(|_| Vec::with_capacity(views.len())).collect();
+    let mut clearest = vec![0.0; gaussians.len()];
     let reweighting = Reweighting {
         passes: settings.reweighting_passes,
         noise_correlation_area: settings.noise_correlation_area,
@@ -61,14 +62,16 @@ pub(super) fn observe(
                 gaussians.len()
             )));
         }
-        observations.par_iter_mut().zip(&moments).enumerate().for_each(|(index, (list, moments))| {
-            list.extend(
-                observation(gaussians, index, camera, moments, settings)
-                    .map(|(fit, transmittance)| Observation { view, fit, transmittance }),
-            );
+        let lists = observations.par_iter_mut().zip(&mut clearest).zip(&moments).enumerate();
+        lists.for_each(|(index, ((list, clearest), moments))| {
+            let Some(transmittance) = transmittance(gaussians, index, camera, moments) else { return };
+            *clearest = transmittance.max(*clearest);
+            let fit = observed_fit(gaussians, index, camera, moments, settings);
+            list.extend(fit.map(|fit| Observation { view, fit, transmittance }));
         });
     }
-    observations.par_iter_mut().for_each(|list| trust_unoccluded(list, settings));
+    let lists = observations.par_iter_mut().zip(&clearest);
+    lists.for_each(|(list, &clearest)| trust_unoccluded(list, clearest, settings));
     Ok(observations)
 }
 
@@ -119,23 +122,18 @@ pub fn no_surer_than(tracks: &TrackField, least: f64) -> TrackField {
     tracks
 }
 
-fn observation(
+/// Mean transmittance of what lies before a Gaussian in the key frame, 0 to 1, whatever its tracks say; `None` where it leaves
+/// no trace in the image.
+fn transmittance(
     gaussians: &Gaussians,
     index: usize,
     camera: &Camera,
     moments: &FootprintMoments,
-    settings: &MotionSettings,
-) -> Option<(Fit, f64)> {
+) -> Option<f64> {
     if moments.blend_weight.is_nan() || moments.blend_weight <= 0.0 {
         return None;
     }
-    let position = camera.to_camera(gaussians.mean(index));
-    let projected = camera.project(position)?;
-    let fit = fit2d::fit(moments, projected, settings)?;
-    if !camera.contains(fit.target) {
-        return None;
-    }
-    let [u, v] = camera.world_jacobian(position);
+    let [u, v] = camera.world_jacobian(camera.to_camera(gaussians.mean(index)));
     let covariance = gaussians.covariance(index);
     let (uu, uv, vv) = (u.dot(covariance * u), u.dot(covariance * v), v.dot(covariance * v));
     let footprint = DMat2::from_cols(DVec2::new(uu + LOW_PASS, uv), DVec2::new(uv, vv + LOW_PASS));
@@ -143,15 +141,28 @@ fn observation(
     let unoccluded =
         gaussians.opacity(index) * std::f64::consts::TAU * footprint.determinant().max(0.0).sqrt();
     let transmittance = (moments.blend_weight / unoccluded).clamp(0.0, 1.0);
-    transmittance.is_finite().then_some((fit, transmittance))
+    transmittance.is_finite().then_some(transmittance)
 }
 
-/// Drops views that hardly see the Gaussian and trusts the others by how well they see it, relative to the
-/// best: a pixel in front of a hidden Gaussian tracks its occluder.
-fn trust_unoccluded(observations: &mut Vec<Observation>, settings: &MotionSettings) {
-    let best = observations.iter().map(|o| o.transmittance).fold(0.0, f64::max);
-    observations.retain(|o| o.transmittance >= settings.min_relative_transmittance * best && best > 0.0);
+fn observed_fit(
+    gaussians: &Gaussians,
+    index: usize,
+    camera: &Camera,
+    moments: &FootprintMoments,
+    settings: &MotionSettings,
+) -> Option<Fit> {
+    let projected = camera.project_world(gaussians.mean(index))?;
+    let fit = fit2d::fit(moments, projected, settings)?;
+    camera.contains(fit.target).then_some(fit)
+}
+
+/// Drops views that hardly see the Gaussian and trusts the others by how well they see it, relative to the view that sees
+/// it most clearly in the key frame, be it hidden there at the target: a pixel in front of a hidden Gaussian tracks its
+/// occluder.
+fn trust_unoccluded(observations: &mut Vec<Observation>, clearest: f64, settings: &MotionSettings) {
+    observations
+        .retain(|o| o.transmittance >= settings.min_relative_transmittance * clearest && clearest > 0.0);
     for observation in observations {
-        observation.fit.variance *= best / observation.transmittance;
+        observation.fit.variance *= clearest / observation.transmittance;
     }
 }

@@ -40,8 +40,8 @@ pub struct MotionSettings {
     /// what remains is likely another surface at its rim.
     #[serde(deserialize_with = "range::share")]
     pub min_visible_share: f64,
-    /// Least mean transmittance before a Gaussian, relative to the view that sees it best, 0 to 1; default
-    /// 0.1. Pixels in front of a hidden Gaussian track its occluder.
+    /// Least mean transmittance before a Gaussian in the key frame, relative to the view that sees it best there, 0 to 1;
+    /// default 0.1. Pixels in front of a hidden Gaussian track its occluder.
     #[serde(deserialize_with = "range::share")]
     pub min_relative_transmittance: f64,
     /// Least number of views that a position is solved from; default 2, as in the paper. A single view still

@@ -9,6 +9,7 @@ mod orders;
 mod parts;
 mod rest;
 mod scenes;
+mod witnesses;
 
 use std::sync::Arc;
 
