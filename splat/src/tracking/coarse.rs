@@ -1,14 +1,11 @@
 //! Exhaustive search on a small image: finds displacements that no pyramid can follow.
 //!
 //! One cost volume serves both directions: the best match of `x` in the second image and the best match of `y` in
-//! the first are the minima over the same costs.
+//! the first are the minima over the same costs. Values are shorts and costs whole numbers, so all instruction sets find
+//! the same.
 
-use super::{
-    flow::Flow,
-    planes::{BORDER, Planes},
-    windows::{box_mean, lanes, lanes_mut},
-};
-use crate::simd::{Instructions, LANES, Simd, simd_kernel};
+use super::{flow::Flow, planes::Planes, windows::box_mean};
+use crate::simd::{Instructions, SHORTS, Shorts, Simd, simd_kernel};
 
 /// The best match of every pixel of one image in the other, in pixels of the searched level; not a number where it
 /// does not lead back.
@@ -23,37 +20,48 @@ const RADIUS: usize = 2;
 const SIDE: usize = 2 * RADIUS + 1;
 /// Half side of the windows whose mean is removed first. Wide, so that a patch keeps its colour.
 const HIGH_PASS_RADIUS: usize = 6;
+/// Largest distance from that mean that is told apart, 0 to 255 scale.
+const CONTRAST: f32 = 109.0;
+/// Steps per grey level: squared differences over 65 536 are those of grey levels over eight.
+const UNIT: f32 = 90.51;
+/// What a pixel counts at most: sums over a window are below 32 768.
+const MOST: u16 = (i16::MAX as usize / (SIDE * SIDE)) as u16;
 
 /// Largest distance along either axis between a pixel and where it comes back to, pixels.
 const ROUND_TRIP: f32 = 1.0;
 
-/// The best match of every pixel so far. Longer than the image by a group of lanes, as rows are not whole groups.
+/// The best match of every pixel so far. Longer than the image by a group, as rows are not whole groups.
 struct Best {
-    cost: Vec<f32>,
-    /// Number of the displacement; a float, so that it is chosen like the cost. At most 513² of them are exact.
-    label: Vec<f32>,
+    /// Cost and number of the displacement, which decides among equal costs.
+    best: Vec<u64>,
+    /// What a cost must be below to be better or equal; 0 where it is perfect.
+    limit: Vec<u16>,
 }
 
 impl Best {
     fn new(pixels: usize) -> Self {
-        Self { cost: vec![f32::INFINITY; pixels + LANES], label: vec![0.0; pixels + LANES] }
+        Self { best: vec![u64::MAX; pixels + SHORTS], limit: vec![i16::MAX as u16; pixels + SHORTS] }
     }
 
-    #[inline(always)]
-    fn offer<S: Simd>(&mut self, first: usize, cost: S, label: S) {
-        let (best, labels) = (lanes_mut(&mut self.cost, first), lanes_mut(&mut self.label, first));
-        let known = S::load(best);
-        let better = cost.lt(known);
-        S::select(better, cost, known).store(best);
-        S::select(better, label, S::load(labels)).store(labels);
+    /// Compares those of the pixels from `first` on whose bits are set.
+    fn take(&mut self, first: usize, mut bits: u32, costs: &[u16; SHORTS], label: u32) {
+        while bits != 0 {
+            let lane = bits.trailing_zeros() as usize;
+            bits &= bits - 1;
+            let offered = u64::from(costs[lane]) << u32::BITS | u64::from(label);
+            if offered < self.best[first + lane] {
+                self.best[first + lane] = offered;
+                self.limit[first + lane] = if costs[lane] == 0 { 0 } else { costs[lane] + 1 };
+            }
+        }
     }
 
-    fn into_flow(self, width: usize, displacements: &[[i32; 2]], sign: f32) -> Flow {
-        let labels = &self.label[..self.label.len() - LANES];
-        let axis = |axis: usize| -> Vec<f32> {
-            labels.iter().map(|&label| sign * displacements[label as usize][axis] as f32).collect()
+    fn into_flow(self, width: usize, height: usize, displacements: &[[i32; 2]]) -> Flow {
+        let axis = |axis: usize| {
+            let displaced = |&best: &u64| displacements[best as u32 as usize][axis] as f32;
+            self.best[..width * height].iter().map(displaced).collect()
         };
-        Flow { width, height: labels.len() / width, u: axis(0), v: axis(1) }
+        Flow { width, height, u: axis(0), v: axis(1) }
     }
 }
 
@@ -67,13 +75,11 @@ pub(super) fn search<const C: usize>(
     radius: usize,
 ) -> CoarseMatches {
     let (width, height) = (first.width, first.height);
-    let images = [first, second].map(|image| smoothed(&image.high_passed(HIGH_PASS_RADIUS)));
+    let images = [first, second].map(Prepared::of);
     let displacements = displacements_by_length(radius.min(width - 1), radius.min(height - 1));
-    let mut matches = [Best::new(width * height), Best::new(width * height)];
+    let mut matches = [(); 2].map(|()| Best::new(width * height));
     compare_all(instructions, &images, &displacements, &mut matches);
-    let [forward, backward] = matches;
-    let mut forward = forward.into_flow(width, &displacements, 1.0);
-    let mut backward = backward.into_flow(width, &displacements, -1.0);
+    let [mut forward, mut backward] = matches.map(|best| best.into_flow(width, height, &displacements));
     let unverified = forward.clone();
     verify(&mut forward, &backward);
     verify(&mut backward, &unverified);
@@ -94,75 +100,83 @@ fn verify(flow: &mut Flow, back: &Flow) {
     }
 }
 
-simd_kernel! {
-    fn compare_all<const C: usize>(
-        images: &[Planes<C>; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
-    ) = compare_kernel
+/// Channels without their local mean, smoothed a little as a displacement of half a coarse pixel must not hide a match,
+/// with [`RADIUS`] replicated pixels on every side.
+struct Prepared<const C: usize> {
+    width: usize,
+    height: usize,
+    stride: usize,
+    channels: [Vec<u16>; C],
 }
 
-#[inline(always)]
-fn compare_kernel<S: Simd, const C: usize>(
-    images: &[Planes<C>; 2],
-    displacements: &[[i32; 2]],
-    matches: &mut [Best; 2],
-) {
-    let width = images[0].width;
-    let mut scratch = Scratch::default();
-    let energies = images.each_ref().map(|image| energy::<S, C>(image, &mut scratch));
-    let steps: [f32; LANES] = std::array::from_fn(|lane| lane as f32);
-    let (steps, nothing) = (S::load(&steps), S::splat(f32::INFINITY));
-    let [forward, backward] = matches;
-    for (label, &[dx, dy]) in displacements.iter().enumerate() {
-        let overlap = Overlap::new(&images[0], [dx, dy]);
-        let label = S::splat(label as f32);
-        scratch.sum_rows::<S, C>(&images[0], &images[1], &overlap);
-        for line in 0..overlap.rows {
-            let at_first = (overlap.first_row + line) * width + overlap.first_column;
-            let at_second = (at_first as i64 + i64::from(dy) * width as i64 + i64::from(dx)) as usize;
-            for column in (0..overlap.columns).step_by(LANES) {
-                let (first, second) = (at_first + column, at_second + column);
-                let both = S::load(lanes(&energies[0], first)).add(S::load(lanes(&energies[1], second)));
-                let product = scratch.window::<S>(line, column);
-                // Rounding must not make a difference better than none.
-                let cost = both.sub(product.add(product)).max(S::splat(0.0));
-                let is_inside = steps.lt(S::splat((overlap.columns - column) as f32));
-                let cost = S::select(is_inside, cost, nothing);
-                forward.offer(first, cost, label);
-                backward.offer(second, cost, label);
-            }
-        }
-    }
-}
-
-/// The window sums of the squares of an image, and a group of lanes more.
-#[inline(always)]
-fn energy<S: Simd, const C: usize>(image: &Planes<C>, scratch: &mut Scratch) -> Vec<f32> {
-    let mut energy = vec![0.0f32; image.width * image.height + LANES];
-    scratch.sum_rows::<S, C>(image, image, &Overlap::new(image, [0, 0]));
-    for y in 0..image.height {
-        for x in (0..image.width).step_by(LANES) {
-            // What is written beyond the row's end the next row overwrites.
-            scratch.window::<S>(y, x).store(lanes_mut(&mut energy, y * image.width + x));
-        }
-    }
-    energy
-}
-
-/// Smoothed a little: a displacement of half a coarse pixel must not hide a match.
-fn smoothed<const C: usize>(planes: &Planes<C>) -> Planes<C> {
-    let interiors = planes.interiors().map(|channel| {
+impl<const C: usize> Prepared<C> {
+    fn of(planes: &Planes<C>) -> Self {
         let (width, height) = (planes.width, planes.height);
-        let box3 = box_mean(&channel, width, height, 1);
-        channel.iter().zip(&box3).map(|(value, mean)| 0.5 * (value + mean)).collect()
-    });
-    Planes::from_interiors(planes.width, planes.height, interiors)
+        let stride = width + 2 * RADIUS;
+        let channels = planes.high_passed(HIGH_PASS_RADIUS).interiors().map(|channel| {
+            let box3 = box_mean(&channel, width, height, 1);
+            let mut shorts = Vec::with_capacity(stride * (height + 2 * RADIUS) + 2 * SHORTS);
+            for y in 0..height + 2 * RADIUS {
+                let row = y.saturating_sub(RADIUS).min(height - 1) * width;
+                let short = |x: usize| {
+                    let value = 0.5 * (channel[row + x] + box3[row + x]);
+                    (UNIT * (value.clamp(-CONTRAST, CONTRAST) + CONTRAST)) as u16
+                };
+                shorts.extend([short(0); RADIUS]);
+                shorts.extend((0..width).map(short));
+                shorts.extend([short(width - 1); RADIUS]);
+            }
+            // Rows are read in whole groups.
+            shorts.extend([0; 2 * SHORTS]);
+            shorts
+        });
+        Self { width, height, stride, channels }
+    }
 }
 
 fn displacements_by_length(radius_x: usize, radius_y: usize) -> Vec<[i32; 2]> {
     let (rx, ry) = (radius_x as i32, radius_y as i32);
     let mut all: Vec<[i32; 2]> = (-ry..=ry).flat_map(|dy| (-rx..=rx).map(move |dx| [dx, dy])).collect();
-    all.sort_by_key(|&[dx, dy]| (dx * dx + dy * dy, dy, dx));
+    all.sort_by_key(length_first);
     all
+}
+
+fn length_first(&[dx, dy]: &[i32; 2]) -> (i32, i32, i32) {
+    (dx * dx + dy * dy, dy, dx)
+}
+
+simd_kernel! {
+    fn compare_all<const C: usize>(
+        images: &[Prepared<C>; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
+    ) = compare_kernel
+}
+
+#[inline(always)]
+fn compare_kernel<S: Simd, const C: usize>(
+    images: &[Prepared<C>; 2],
+    displacements: &[[i32; 2]],
+    matches: &mut [Best; 2],
+) {
+    let width = images[0].width;
+    let mut sums = WindowSums::new(width);
+    for (label, displacement) in displacements.iter().enumerate() {
+        let [dx, dy] = *displacement;
+        let opposite = displacements.binary_search_by_key(&length_first(&[-dx, -dy]), length_first);
+        let labels = [label as u32, opposite.unwrap_or(label) as u32];
+        let overlap = Overlap::new(&images[0], [dx, dy]);
+        sums.begin(overlap.columns);
+        let lines = overlap.rows + 2 * RADIUS;
+        // Sums are read a row later: what was just written is not yet in the cache.
+        for line in 0..=lines {
+            if line < lines {
+                sums.add_row::<S::Shorts, C>(images, &overlap, line);
+            }
+            let Some(line) = line.checked_sub(SIDE) else { continue };
+            let first = (overlap.first_row + line) * width + overlap.first_column;
+            let second = (first as i64 + i64::from(dy) * width as i64 + i64::from(dx)) as usize;
+            sums.offer::<S::Shorts>(line + SIDE - 1, [first, second], labels, matches);
+        }
+    }
 }
 
 /// The pixels of the first image whose counterpart at some displacement lies in the second.
@@ -175,7 +189,7 @@ struct Overlap {
 }
 
 impl Overlap {
-    fn new<const C: usize>(image: &Planes<C>, displacement: [i32; 2]) -> Self {
+    fn new<const C: usize>(image: &Prepared<C>, displacement: [i32; 2]) -> Self {
         let [dx, dy] = displacement;
         Self {
             displacement,
@@ -187,57 +201,102 @@ impl Overlap {
     }
 }
 
-/// Window sums of the products of two images, one shifted, computed without allocating per displacement. Rows are
-/// filled up to whole groups of lanes with anything.
-#[derive(Default)]
-struct Scratch {
-    products: Vec<f32>,
-    /// Sums along rows, from `RADIUS` rows before the overlap to as many after it.
-    sums: Vec<f32>,
+/// Sums of absolute differences over windows, row after row.
+struct WindowSums {
     columns: usize,
+    /// The differences of the last rows, in turn.
+    rows: [Vec<u16>; SIDE],
+    /// Their sums along columns, as they were after every other row.
+    sums: [Vec<u16>; 2],
 }
 
-impl Scratch {
-    /// Sums along the rows of `first` that `second`, shifted, overlaps.
-    ///
-    /// Reads up to two groups of lanes beyond the end of a row: the border below has them.
+impl WindowSums {
+    fn new(width: usize) -> Self {
+        let row = || vec![0u16; (width + 2 * RADIUS).next_multiple_of(SHORTS) + SHORTS];
+        Self { columns: 0, rows: [(); SIDE].map(|()| row()), sums: [row(), row()] }
+    }
+
     #[inline(always)]
-    fn sum_rows<S: Simd, const C: usize>(
-        &mut self,
-        first: &Planes<C>,
-        second: &Planes<C>,
-        overlap: &Overlap,
-    ) {
-        self.columns = overlap.columns.next_multiple_of(LANES);
-        let padded = self.columns + LANES;
-        let [dx, dy] = overlap.displacement.map(i64::from);
-        self.products.resize(padded, 0.0);
-        self.sums.resize((overlap.rows + 2 * RADIUS) * self.columns, 0.0);
-        for (line, sums) in self.sums.chunks_exact_mut(self.columns).enumerate() {
-            let row = overlap.first_row + line + BORDER - RADIUS;
-            let at = row * first.stride + overlap.first_column + BORDER - RADIUS;
-            let shifted = (at as i64 + dy * second.stride as i64 + dx) as usize;
-            for column in (0..padded).step_by(LANES) {
-                let mut product = S::splat(0.0);
-                for (a, b) in first.channels.iter().zip(&second.channels) {
-                    let (a, b) = (S::load(lanes(a, at + column)), S::load(lanes(b, shifted + column)));
-                    product = a.mul_add(b, product);
-                }
-                product.store(lanes_mut(&mut self.products, column));
-            }
-            for (block, to) in sums.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
-                let product = |shift: usize| S::load(lanes(&self.products, block * LANES + shift));
-                (1..SIDE).fold(product(0), |sum, shift| sum.add(product(shift))).store(to);
-            }
+    fn begin(&mut self, columns: usize) {
+        self.columns = columns;
+        for row in &mut self.rows {
+            row.fill(0);
+        }
+        for sums in &mut self.sums {
+            sums.fill(0);
         }
     }
 
-    /// Sums over the windows around [`LANES`] pixels of a line of the overlap.
+    /// Takes in a row of differences, the first of which lies [`RADIUS`] rows before the overlap, and forgets that of
+    /// [`SIDE`] rows before.
     #[inline(always)]
-    fn window<S: Simd>(&self, line: usize, column: usize) -> S {
-        let row = |shift: usize| S::load(lanes(&self.sums, (line + shift) * self.columns + column));
-        (1..SIDE).fold(row(0), |sum, shift| sum.add(row(shift)))
+    fn add_row<S: Shorts, const C: usize>(&mut self, images: &[Prepared<C>; 2], overlap: &Overlap, line: usize) {
+        let [first, second] = images;
+        let groups = (self.columns + 2 * RADIUS).div_ceil(SHORTS);
+        let [dx, dy] = overlap.displacement.map(i64::from);
+        // The border shifts both axes by the radius, and the first row and column lie as far before the overlap.
+        let at = (overlap.first_row + line) * first.stride + overlap.first_column;
+        let shifted = (at as i64 + dy * second.stride as i64 + dx) as usize;
+        let mut here: [&[[u16; SHORTS]]; C] = [&[]; C];
+        let mut there: [&[[u16; SHORTS]]; C] = [&[]; C];
+        for c in 0..C {
+            here[c] = in_groups(&first.channels[c], at, groups);
+            there[c] = in_groups(&second.channels[c], shifted, groups);
+        }
+        let row = &mut self.rows[line % SIDE].as_chunks_mut().0[..groups];
+        let [even, odd] = &mut self.sums;
+        let (before, after) = if line % 2 == 0 { (odd, even) } else { (even, odd) };
+        let before = &before.as_chunks().0[..groups];
+        let after = &mut after.as_chunks_mut().0[..groups];
+        for group in 0..groups {
+            let mut squares = S::splat(0);
+            for c in 0..C {
+                let (a, b) = (S::load(&here[c][group]), S::load(&there[c][group]));
+                squares = squares.add(a.squared_difference(b));
+            }
+            let squares = squares.min(S::splat(MOST));
+            let sum = S::load(&before[group]).add(squares).sub(S::load(&row[group]));
+            sum.store(&mut after[group]);
+            squares.store(&mut row[group]);
+        }
     }
+
+    /// Offers the windows of the last [`SIDE`] rows to the pixels from `at[0]` on of one image and those from `at[1]` on of
+    /// the other.
+    #[inline(always)]
+    fn offer<S: Shorts>(&self, line: usize, at: [usize; 2], labels: [u32; 2], matches: &mut [Best; 2]) {
+        let groups = self.columns.div_ceil(SHORTS);
+        let mut shifted: [&[[u16; SHORTS]]; SIDE] = [&[]; SIDE];
+        for k in 0..SIDE {
+            shifted[k] = in_groups(&self.sums[line % 2], k, groups);
+        }
+        for group in 0..groups {
+            let mut costs = S::load(&shifted[0][group]);
+            for k in 1..SIDE {
+                costs = costs.add(S::load(&shifted[k][group]));
+            }
+            let column = group * SHORTS;
+            let inside = u32::MAX >> SHORTS.saturating_sub(self.columns - column);
+            let better = [
+                costs.below(S::load(&in_groups(&matches[0].limit, at[0] + column, 1)[0])) & inside,
+                costs.below(S::load(&in_groups(&matches[1].limit, at[1] + column, 1)[0])) & inside,
+            ];
+            if better[0] | better[1] == 0 {
+                continue;
+            }
+            let mut values = [0; SHORTS];
+            costs.store(&mut values);
+            for way in 0..2 {
+                matches[way].take(at[way] + column, better[way], &values, labels[way]);
+            }
+        }
+    }
+}
+
+/// The numbers from `first` on, in groups.
+#[inline(always)]
+fn in_groups<T>(values: &[T], first: usize, groups: usize) -> &[[T; SHORTS]] {
+    &values[first..first + groups * SHORTS].as_chunks().0[..groups]
 }
 
 #[cfg(test)]

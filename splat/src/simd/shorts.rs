@@ -1,0 +1,196 @@
+//! Thirty-two 16-bit whole numbers at a time, exact on every instruction set.
+
+#[cfg(target_arch = "x86_64")]
+use std::arch::x86_64::*;
+
+/// Numbers per group.
+pub(crate) const SHORTS: usize = 32;
+
+/// A group of [`SHORTS`] whole numbers from 0 to 32 767.
+///
+/// # Contract
+/// That of [`Simd`](super::Simd), which names the implementation for each instruction set.
+pub(crate) trait Shorts: Copy {
+    fn load(from: &[u16; SHORTS]) -> Self;
+    fn store(self, to: &mut [u16; SHORTS]);
+    /// The sum, which must be below 32 768.
+    fn add(self, other: Self) -> Self;
+    /// The difference, which must not be negative.
+    fn sub(self, other: Self) -> Self;
+    /// The squared difference over 65 536, rounded down.
+    fn squared_difference(self, other: Self) -> Self;
+    fn min(self, other: Self) -> Self;
+    fn splat(value: u16) -> Self;
+    /// Bit `n` says whether lane `n` is below that of the other group.
+    fn below(self, other: Self) -> u32;
+}
+
+/// Plain arrays.
+#[derive(Clone, Copy)]
+pub(crate) struct PlainShorts([u16; SHORTS]);
+
+impl Shorts for PlainShorts {
+    #[inline(always)]
+    fn load(from: &[u16; SHORTS]) -> Self {
+        Self(*from)
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [u16; SHORTS]) {
+        *to = self.0;
+    }
+    #[inline(always)]
+    fn add(mut self, other: Self) -> Self {
+        for lane in 0..SHORTS {
+            self.0[lane] += other.0[lane];
+        }
+        self
+    }
+    #[inline(always)]
+    fn sub(mut self, other: Self) -> Self {
+        for lane in 0..SHORTS {
+            self.0[lane] -= other.0[lane];
+        }
+        self
+    }
+    #[inline(always)]
+    fn squared_difference(mut self, other: Self) -> Self {
+        for lane in 0..SHORTS {
+            let difference = i32::from(self.0[lane]) - i32::from(other.0[lane]);
+            self.0[lane] = ((difference * difference) >> u16::BITS) as u16;
+        }
+        self
+    }
+    #[inline(always)]
+    fn min(mut self, other: Self) -> Self {
+        for lane in 0..SHORTS {
+            self.0[lane] = self.0[lane].min(other.0[lane]);
+        }
+        self
+    }
+    #[inline(always)]
+    fn splat(value: u16) -> Self {
+        Self([value; SHORTS])
+    }
+    #[inline(always)]
+    fn below(self, other: Self) -> u32 {
+        let mut bits = 0;
+        for lane in 0..SHORTS {
+            bits |= u32::from(self.0[lane] < other.0[lane]) << lane;
+        }
+        bits
+    }
+}
+
+/// Wraps intrinsics whose only demand is the instruction set.
+#[cfg(target_arch = "x86_64")]
+macro_rules! intrinsic {
+    ($call:expr) => {
+        // SAFETY: by the contract of `Simd` this runs on a machine with the instruction set; memory operands are
+        // unaligned accesses to whole arrays of numbers.
+        unsafe { $call }
+    };
+}
+
+/// One 512-bit register.
+#[cfg(target_arch = "x86_64")]
+#[derive(Clone, Copy)]
+pub(crate) struct Avx512Shorts(__m512i);
+
+#[cfg(target_arch = "x86_64")]
+impl Shorts for Avx512Shorts {
+    #[inline(always)]
+    fn load(from: &[u16; SHORTS]) -> Self {
+        Self(intrinsic!(_mm512_loadu_si512(from.as_ptr().cast())))
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [u16; SHORTS]) {
+        intrinsic!(_mm512_storeu_si512(to.as_mut_ptr().cast(), self.0));
+    }
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        Self(intrinsic!(_mm512_add_epi16(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        Self(intrinsic!(_mm512_sub_epi16(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn squared_difference(self, other: Self) -> Self {
+        intrinsic!({
+            let difference = _mm512_sub_epi16(self.0, other.0);
+            Self(_mm512_mulhi_epi16(difference, difference))
+        })
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        Self(intrinsic!(_mm512_min_epi16(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn splat(value: u16) -> Self {
+        Self(intrinsic!(_mm512_set1_epi16(value.cast_signed())))
+    }
+    #[inline(always)]
+    fn below(self, other: Self) -> u32 {
+        intrinsic!(_mm512_cmplt_epi16_mask(self.0, other.0))
+    }
+}
+
+/// Two 256-bit registers.
+#[cfg(target_arch = "x86_64")]
+#[derive(Clone, Copy)]
+pub(crate) struct Avx2Shorts(__m256i, __m256i);
+
+#[cfg(target_arch = "x86_64")]
+impl Shorts for Avx2Shorts {
+    #[inline(always)]
+    fn load(from: &[u16; SHORTS]) -> Self {
+        let (low, high) = from.split_at(SHORTS / 2);
+        intrinsic!(Self(
+            _mm256_loadu_si256(low.as_ptr().cast()),
+            _mm256_loadu_si256(high.as_ptr().cast())
+        ))
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [u16; SHORTS]) {
+        let (low, high) = to.split_at_mut(SHORTS / 2);
+        intrinsic!({
+            _mm256_storeu_si256(low.as_mut_ptr().cast(), self.0);
+            _mm256_storeu_si256(high.as_mut_ptr().cast(), self.1);
+        });
+    }
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        intrinsic!(Self(_mm256_add_epi16(self.0, other.0), _mm256_add_epi16(self.1, other.1)))
+    }
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        intrinsic!(Self(_mm256_sub_epi16(self.0, other.0), _mm256_sub_epi16(self.1, other.1)))
+    }
+    #[inline(always)]
+    fn squared_difference(self, other: Self) -> Self {
+        intrinsic!({
+            let low = _mm256_sub_epi16(self.0, other.0);
+            let high = _mm256_sub_epi16(self.1, other.1);
+            Self(_mm256_mulhi_epi16(low, low), _mm256_mulhi_epi16(high, high))
+        })
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        intrinsic!(Self(_mm256_min_epi16(self.0, other.0), _mm256_min_epi16(self.1, other.1)))
+    }
+    #[inline(always)]
+    fn splat(value: u16) -> Self {
+        let half = intrinsic!(_mm256_set1_epi16(value.cast_signed()));
+        Self(half, half)
+    }
+    #[inline(always)]
+    fn below(self, other: Self) -> u32 {
+        intrinsic!({
+            let low = _mm256_cmpgt_epi16(other.0, self.0);
+            let high = _mm256_cmpgt_epi16(other.1, self.1);
+            // Packing works within halves of a register: the middle quarters change places.
+            let bytes = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi16(low, high));
+            _mm256_movemask_epi8(bytes).cast_unsigned()
+        })
+    }
+}
