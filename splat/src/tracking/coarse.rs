@@ -24,6 +24,8 @@ const HIGH_PASS_RADIUS: usize = 6;
 const CONTRAST: f32 = 109.0;
 /// Steps per grey level: squared differences over 65 536 are those of grey levels over eight.
 const UNIT: f32 = 90.51;
+/// Cost below which a window rests: two grey levels, root mean square, are noise.
+const AT_REST: u16 = (3 * SIDE * SIDE * 4 / 8) as u16;
 /// What a pixel counts at most: sums over a window are below 32 768.
 const MOST: u16 = (i16::MAX as usize / (SIDE * SIDE)) as u16;
 
@@ -54,6 +56,25 @@ impl Best {
                 self.limit[first + lane] = if costs[lane] == 0 { 0 } else { costs[lane] + 1 };
             }
         }
+    }
+
+    /// The pixels whose windows differ at the only displacement that was compared so far, and what lies between them.
+    fn not_at_rest(&self, width: usize) -> Region {
+        let mut region = Region { first_column: width, first_row: 0, columns: 0, rows: 0 };
+        let mut end = 0;
+        let rows = self.limit[..self.limit.len() - SHORTS].chunks_exact(width);
+        for (y, row) in rows.enumerate() {
+            let Some(from) = row.iter().position(|&limit| limit > AT_REST) else { continue };
+            let to = width - row.iter().rev().take_while(|&&limit| limit <= AT_REST).count();
+            if region.rows == 0 {
+                region.first_row = y;
+            }
+            region.rows = y + 1 - region.first_row;
+            region.first_column = region.first_column.min(from);
+            end = end.max(to);
+        }
+        region.columns = end.saturating_sub(region.first_column);
+        region
     }
 
     fn into_flow(self, width: usize, height: usize, displacements: &[[i32; 2]]) -> Flow {
@@ -157,51 +178,57 @@ fn compare_kernel<S: Simd, const C: usize>(
     displacements: &[[i32; 2]],
     matches: &mut [Best; 2],
 ) {
-    let width = images[0].width;
-    let mut sums = WindowSums::new(width);
-    for (label, displacement) in displacements.iter().enumerate() {
-        let [dx, dy] = *displacement;
-        let opposite = displacements.binary_search_by_key(&length_first(&[-dx, -dy]), length_first);
-        let labels = [label as u32, opposite.unwrap_or(label) as u32];
-        let overlap = Overlap::new(&images[0], [dx, dy]);
-        sums.begin(overlap.columns);
-        let lines = overlap.rows + 2 * RADIUS;
-        // Sums are read a row later: what was just written is not yet in the cache.
-        for line in 0..=lines {
-            if line < lines {
-                sums.add_row::<S::Shorts, C>(images, &overlap, line);
-            }
-            let Some(line) = line.checked_sub(SIDE) else { continue };
-            let first = (overlap.first_row + line) * width + overlap.first_column;
-            let second = (first as i64 + i64::from(dy) * width as i64 + i64::from(dx)) as usize;
-            sums.offer::<S::Shorts>(line + SIDE - 1, [first, second], labels, matches);
+    let mut sums = WindowSums::new(images[0].width);
+    let mut region = Region::all(&images[0]);
+    let mut shorter = 0;
+    for equally_long in displacements.chunk_by(|a, b| length_first(a).0 == length_first(b).0) {
+        let last = equally_long.len() - 1;
+        for (n, &displacement) in equally_long.iter().enumerate() {
+            // Where one displacement is the nth of its length, its opposite is the nth from the end.
+            let labels = [shorter + n as u32, shorter + (last - n) as u32];
+            sums.compare::<S::Shorts, C>(images, region.overlap(displacement), labels, matches);
         }
+        if shorter == 0 {
+            region = matches[0].not_at_rest(images[0].width);
+        }
+        shorter += equally_long.len() as u32;
     }
 }
 
-/// The pixels of the first image whose counterpart at some displacement lies in the second.
-struct Overlap {
-    displacement: [i32; 2],
+/// A rectangle of pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Region {
     first_column: usize,
     first_row: usize,
     columns: usize,
     rows: usize,
 }
 
-impl Overlap {
-    fn new<const C: usize>(image: &Prepared<C>, displacement: [i32; 2]) -> Self {
+impl Region {
+    fn all<const C: usize>(image: &Prepared<C>) -> Self {
+        Self { first_column: 0, first_row: 0, columns: image.width, rows: image.height }
+    }
+
+    /// Those of its pixels that a displacement leaves in it.
+    fn overlap(self, displacement: [i32; 2]) -> Overlap {
         let [dx, dy] = displacement;
-        Self {
-            displacement,
-            first_column: (-dx).max(0) as usize,
-            first_row: (-dy).max(0) as usize,
-            columns: image.width - dx.unsigned_abs() as usize,
-            rows: image.height - dy.unsigned_abs() as usize,
-        }
+        let within = Self {
+            first_column: self.first_column + (-dx).max(0) as usize,
+            first_row: self.first_row + (-dy).max(0) as usize,
+            columns: self.columns.saturating_sub(dx.unsigned_abs() as usize),
+            rows: self.rows.saturating_sub(dy.unsigned_abs() as usize),
+        };
+        Overlap { displacement, within }
     }
 }
 
-/// Sums of absolute differences over windows, row after row.
+/// Pixels of the first image whose counterparts at some displacement are compared with them.
+struct Overlap {
+    displacement: [i32; 2],
+    within: Region,
+}
+
+/// Sums of squared differences over windows, row after row.
 struct WindowSums {
     columns: usize,
     /// The differences of the last rows, in turn.
@@ -216,14 +243,39 @@ impl WindowSums {
         Self { columns: 0, rows: [(); SIDE].map(|()| row()), sums: [row(), row()] }
     }
 
+    /// Offers the windows of an overlap to the pixels of both images.
+    #[inline(always)]
+    fn compare<S: Shorts, const C: usize>(
+        &mut self,
+        images: &[Prepared<C>; 2],
+        overlap: Overlap,
+        labels: [u32; 2],
+        matches: &mut [Best; 2],
+    ) {
+        let Overlap { displacement: [dx, dy], within } = overlap;
+        if within.rows == 0 || within.columns == 0 {
+            return;
+        }
+        self.begin(within.columns);
+        let width = images[0].width;
+        let lines = within.rows + 2 * RADIUS;
+        // Sums are read a row later: what was just written is not yet in the cache.
+        for line in 0..=lines {
+            if line < lines {
+                self.add_row::<S, C>(images, &overlap, line);
+            }
+            let Some(row) = line.checked_sub(SIDE) else { continue };
+            let first = (within.first_row + row) * width + within.first_column;
+            let second = (first as i64 + i64::from(dy) * width as i64 + i64::from(dx)) as usize;
+            self.offer::<S>(line - 1, [first, second], labels, matches);
+        }
+    }
+
     #[inline(always)]
     fn begin(&mut self, columns: usize) {
         self.columns = columns;
-        for row in &mut self.rows {
+        for row in self.rows.iter_mut().chain(&mut self.sums) {
             row.fill(0);
-        }
-        for sums in &mut self.sums {
-            sums.fill(0);
         }
     }
 
@@ -235,7 +287,7 @@ impl WindowSums {
         let groups = (self.columns + 2 * RADIUS).div_ceil(SHORTS);
         let [dx, dy] = overlap.displacement.map(i64::from);
         // The border shifts both axes by the radius, and the first row and column lie as far before the overlap.
-        let at = (overlap.first_row + line) * first.stride + overlap.first_column;
+        let at = (overlap.within.first_row + line) * first.stride + overlap.within.first_column;
         let shifted = (at as i64 + dy * second.stride as i64 + dx) as usize;
         let mut here: [&[[u16; SHORTS]]; C] = [&[]; C];
         let mut there: [&[[u16; SHORTS]]; C] = [&[]; C];
