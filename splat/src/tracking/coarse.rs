@@ -99,7 +99,7 @@ pub(super) fn search<const C: usize>(
     let images = [first, second].map(Prepared::of);
     let displacements = displacements_by_length(radius.min(width - 1), radius.min(height - 1));
     let mut matches = [(); 2].map(|()| Best::new(width * height));
-    compare_all(instructions, &images, &displacements, &mut matches);
+    compare_all(instructions.at_most_avx2(), &images, &displacements, &mut matches);
     let [mut forward, mut backward] = matches.map(|best| best.into_flow(width, height, &displacements));
     let unverified = forward.clone();
     verify(&mut forward, &backward);
