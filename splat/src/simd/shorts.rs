@@ -1,16 +1,17 @@
-//! Thirty-two 16-bit whole numbers at a time, exact on every instruction set.
+//! Sixteen 16-bit whole numbers at a time, exact on every instruction set.
 
 #[cfg(target_arch = "x86_64")]
 use std::arch::x86_64::*;
 
 /// Numbers per group.
-pub(crate) const SHORTS: usize = 32;
+pub(crate) const SHORTS: usize = 16;
 
 /// A group of [`SHORTS`] whole numbers from 0 to 32 767.
 ///
 /// # Contract
 /// That of [`Simd`](super::Simd), which names the implementation for each instruction set.
 pub(crate) trait Shorts: Copy {
+    fn splat(value: u16) -> Self;
     fn load(from: &[u16; SHORTS]) -> Self;
     fn store(self, to: &mut [u16; SHORTS]);
     /// The sum, which must be below 32 768.
@@ -20,9 +21,8 @@ pub(crate) trait Shorts: Copy {
     /// The squared difference over 65 536, rounded down.
     fn squared_difference(self, other: Self) -> Self;
     fn min(self, other: Self) -> Self;
-    fn splat(value: u16) -> Self;
     /// Bit `n` says whether lane `n` is below that of the other group.
-    fn below(self, other: Self) -> u32;
+    fn below(self, other: Self) -> u16;
 }
 
 /// Plain arrays.
@@ -72,10 +72,10 @@ impl Shorts for PlainShorts {
         Self([value; SHORTS])
     }
     #[inline(always)]
-    fn below(self, other: Self) -> u32 {
+    fn below(self, other: Self) -> u16 {
         let mut bits = 0;
         for lane in 0..SHORTS {
-            bits |= u32::from(self.0[lane] < other.0[lane]) << lane;
+            bits |= u16::from(self.0[lane] < other.0[lane]) << lane;
         }
         bits
     }
@@ -91,106 +91,48 @@ macro_rules! intrinsic {
     };
 }
 
-/// One 512-bit register.
+/// One 256-bit register.
 #[cfg(target_arch = "x86_64")]
 #[derive(Clone, Copy)]
-pub(crate) struct Avx512Shorts(__m512i);
-
-#[cfg(target_arch = "x86_64")]
-impl Shorts for Avx512Shorts {
-    #[inline(always)]
-    fn load(from: &[u16; SHORTS]) -> Self {
-        Self(intrinsic!(_mm512_loadu_si512(from.as_ptr().cast())))
-    }
-    #[inline(always)]
-    fn store(self, to: &mut [u16; SHORTS]) {
-        intrinsic!(_mm512_storeu_si512(to.as_mut_ptr().cast(), self.0));
-    }
-    #[inline(always)]
-    fn add(self, other: Self) -> Self {
-        Self(intrinsic!(_mm512_add_epi16(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn sub(self, other: Self) -> Self {
-        Self(intrinsic!(_mm512_sub_epi16(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn squared_difference(self, other: Self) -> Self {
-        intrinsic!({
-            let difference = _mm512_sub_epi16(self.0, other.0);
-            Self(_mm512_mulhi_epi16(difference, difference))
-        })
-    }
-    #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        Self(intrinsic!(_mm512_min_epi16(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn splat(value: u16) -> Self {
-        Self(intrinsic!(_mm512_set1_epi16(value.cast_signed())))
-    }
-    #[inline(always)]
-    fn below(self, other: Self) -> u32 {
-        intrinsic!(_mm512_cmplt_epi16_mask(self.0, other.0))
-    }
-}
-
-/// Two 256-bit registers.
-#[cfg(target_arch = "x86_64")]
-#[derive(Clone, Copy)]
-pub(crate) struct Avx2Shorts(__m256i, __m256i);
+pub(crate) struct Avx2Shorts(__m256i);
 
 #[cfg(target_arch = "x86_64")]
 impl Shorts for Avx2Shorts {
     #[inline(always)]
+    fn splat(value: u16) -> Self {
+        Self(intrinsic!(_mm256_set1_epi16(value.cast_signed())))
+    }
+    #[inline(always)]
     fn load(from: &[u16; SHORTS]) -> Self {
-        let (low, high) = from.split_at(SHORTS / 2);
-        intrinsic!(Self(
-            _mm256_loadu_si256(low.as_ptr().cast()),
-            _mm256_loadu_si256(high.as_ptr().cast())
-        ))
+        Self(intrinsic!(_mm256_loadu_si256(from.as_ptr().cast())))
     }
     #[inline(always)]
     fn store(self, to: &mut [u16; SHORTS]) {
-        let (low, high) = to.split_at_mut(SHORTS / 2);
-        intrinsic!({
-            _mm256_storeu_si256(low.as_mut_ptr().cast(), self.0);
-            _mm256_storeu_si256(high.as_mut_ptr().cast(), self.1);
-        });
+        intrinsic!(_mm256_storeu_si256(to.as_mut_ptr().cast(), self.0));
     }
     #[inline(always)]
     fn add(self, other: Self) -> Self {
-        intrinsic!(Self(_mm256_add_epi16(self.0, other.0), _mm256_add_epi16(self.1, other.1)))
+        Self(intrinsic!(_mm256_add_epi16(self.0, other.0)))
     }
     #[inline(always)]
     fn sub(self, other: Self) -> Self {
-        intrinsic!(Self(_mm256_sub_epi16(self.0, other.0), _mm256_sub_epi16(self.1, other.1)))
-    }
-    #[inline(always)]
-    fn squared_difference(self, other: Self) -> Self {
-        intrinsic!({
-            let low = _mm256_sub_epi16(self.0, other.0);
-            let high = _mm256_sub_epi16(self.1, other.1);
-            Self(_mm256_mulhi_epi16(low, low), _mm256_mulhi_epi16(high, high))
-        })
+        Self(intrinsic!(_mm256_sub_epi16(self.0, other.0)))
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        intrinsic!(Self(_mm256_min_epi16(self.0, other.0), _mm256_min_epi16(self.1, other.1)))
+        Self(intrinsic!(_mm256_min_epi16(self.0, other.0)))
     }
     #[inline(always)]
-    fn splat(value: u16) -> Self {
-        let half = intrinsic!(_mm256_set1_epi16(value.cast_signed()));
-        Self(half, half)
+    fn squared_difference(self, other: Self) -> Self {
+        let difference = intrinsic!(_mm256_sub_epi16(self.0, other.0));
+        Self(intrinsic!(_mm256_mulhi_epi16(difference, difference)))
     }
     #[inline(always)]
-    fn below(self, other: Self) -> u32 {
+    fn below(self, other: Self) -> u16 {
         intrinsic!({
-            let low = _mm256_cmpgt_epi16(other.0, self.0);
-            let high = _mm256_cmpgt_epi16(other.1, self.1);
-            // Packing works within halves of a register: the middle quarters change places.
-            let bytes = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi16(low, high));
-            _mm256_movemask_epi8(bytes).cast_unsigned()
+            let below = _mm256_cmpgt_epi16(other.0, self.0);
+            let bytes = _mm_packs_epi16(_mm256_castsi256_si128(below), _mm256_extracti128_si256::<1>(below));
+            _mm_movemask_epi8(bytes) as u16
         })
     }
 }

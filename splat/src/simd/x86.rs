@@ -5,7 +5,7 @@ use std::arch::x86_64::*;
 use super::{
     LANES, Plain, ROWS, Simd,
     doubles::{Avx2Doubles, Avx512Doubles},
-    shorts::{Avx2Shorts, Avx512Shorts},
+    shorts::Avx2Shorts,
 };
 
 /// One 512-bit register.
@@ -28,7 +28,8 @@ macro_rules! intrinsic {
 impl Simd for Avx512 {
     type Mask = __mmask16;
     type Doubles = Avx512Doubles;
-    type Shorts = Avx512Shorts;
+    // Unaligned loads of 512 bits always touch two lines of the cache.
+    type Shorts = Avx2Shorts;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self(intrinsic!(_mm512_set1_ps(value)))

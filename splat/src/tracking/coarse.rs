@@ -45,19 +45,6 @@ impl Best {
         Self { best: vec![u64::MAX; pixels + SHORTS], limit: vec![i16::MAX as u16; pixels + SHORTS] }
     }
 
-    /// Compares those of the pixels from `first` on whose bits are set.
-    fn take(&mut self, first: usize, mut bits: u32, costs: &[u16; SHORTS], label: u32) {
-        while bits != 0 {
-            let lane = bits.trailing_zeros() as usize;
-            bits &= bits - 1;
-            let offered = u64::from(costs[lane]) << u32::BITS | u64::from(label);
-            if offered < self.best[first + lane] {
-                self.best[first + lane] = offered;
-                self.limit[first + lane] = if costs[lane] == 0 { 0 } else { costs[lane] + 1 };
-            }
-        }
-    }
-
     /// The pixels whose windows differ at the only displacement that was compared so far, and what lies between them.
     fn not_at_rest(&self, width: usize) -> Region {
         let mut region = Region { first_column: width, first_row: 0, columns: 0, rows: 0 };
@@ -99,7 +86,7 @@ pub(super) fn search<const C: usize>(
     let images = [first, second].map(Prepared::of);
     let displacements = displacements_by_length(radius.min(width - 1), radius.min(height - 1));
     let mut matches = [(); 2].map(|()| Best::new(width * height));
-    compare_all(instructions.at_most_avx2(), &images, &displacements, &mut matches);
+    compare_all(instructions, &images, &displacements, &mut matches);
     let [mut forward, mut backward] = matches.map(|best| best.into_flow(width, height, &displacements));
     let unverified = forward.clone();
     verify(&mut forward, &backward);
@@ -231,16 +218,18 @@ struct Overlap {
 /// Sums of squared differences over windows, row after row.
 struct WindowSums {
     columns: usize,
-    /// The differences of the last rows, in turn.
-    rows: [Vec<u16>; SIDE],
+    /// Numbers per row of both fields below.
+    stride: usize,
+    /// The squared differences of the last rows, in turn.
+    squares: Vec<u16>,
     /// Their sums along columns, as they were after every other row.
-    sums: [Vec<u16>; 2],
+    sums: Vec<u16>,
 }
 
 impl WindowSums {
     fn new(width: usize) -> Self {
-        let row = || vec![0u16; (width + 2 * RADIUS).next_multiple_of(SHORTS) + SHORTS];
-        Self { columns: 0, rows: [(); SIDE].map(|()| row()), sums: [row(), row()] }
+        let stride = (width + 2 * RADIUS).next_multiple_of(SHORTS) + SHORTS;
+        Self { columns: 0, stride, squares: vec![0; SIDE * stride], sums: vec![0; 2 * stride] }
     }
 
     /// Offers the windows of an overlap to the pixels of both images.
@@ -256,7 +245,9 @@ impl WindowSums {
         if within.rows == 0 || within.columns == 0 {
             return;
         }
-        self.begin(within.columns);
+        self.columns = within.columns;
+        self.squares.fill(0);
+        self.sums.fill(0);
         let width = images[0].width;
         let lines = within.rows + 2 * RADIUS;
         // Sums are read a row later: what was just written is not yet in the cache.
@@ -271,18 +262,15 @@ impl WindowSums {
         }
     }
 
+    /// Takes in a row of squared differences, the first of which lies [`RADIUS`] rows before the overlap, and forgets that
+    /// of [`SIDE`] rows before.
     #[inline(always)]
-    fn begin(&mut self, columns: usize) {
-        self.columns = columns;
-        for row in self.rows.iter_mut().chain(&mut self.sums) {
-            row.fill(0);
-        }
-    }
-
-    /// Takes in a row of differences, the first of which lies [`RADIUS`] rows before the overlap, and forgets that of
-    /// [`SIDE`] rows before.
-    #[inline(always)]
-    fn add_row<S: Shorts, const C: usize>(&mut self, images: &[Prepared<C>; 2], overlap: &Overlap, line: usize) {
+    fn add_row<S: Shorts, const C: usize>(
+        &mut self,
+        images: &[Prepared<C>; 2],
+        overlap: &Overlap,
+        line: usize,
+    ) {
         let [first, second] = images;
         let groups = (self.columns + 2 * RADIUS).div_ceil(SHORTS);
         let [dx, dy] = overlap.displacement.map(i64::from);
@@ -295,11 +283,10 @@ impl WindowSums {
             here[c] = in_groups(&first.channels[c], at, groups);
             there[c] = in_groups(&second.channels[c], shifted, groups);
         }
-        let row = &mut self.rows[line % SIDE].as_chunks_mut().0[..groups];
-        let [even, odd] = &mut self.sums;
+        let row = in_groups_mut(&mut self.squares, line % SIDE * self.stride, groups);
+        let (even, odd) = self.sums.split_at_mut(self.stride);
         let (before, after) = if line % 2 == 0 { (odd, even) } else { (even, odd) };
-        let before = &before.as_chunks().0[..groups];
-        let after = &mut after.as_chunks_mut().0[..groups];
+        let (before, after) = (in_groups(before, 0, groups), in_groups_mut(after, 0, groups));
         for group in 0..groups {
             let mut squares = S::splat(0);
             for c in 0..C {
@@ -313,36 +300,58 @@ impl WindowSums {
         }
     }
 
-    /// Offers the windows of the last [`SIDE`] rows to the pixels from `at[0]` on of one image and those from `at[1]` on of
-    /// the other.
+    /// Offers the windows that end in a row to the pixels from `at[0]` on of one image and those from `at[1]` on of the
+    /// other.
     #[inline(always)]
     fn offer<S: Shorts>(&self, line: usize, at: [usize; 2], labels: [u32; 2], matches: &mut [Best; 2]) {
         let groups = self.columns.div_ceil(SHORTS);
         let mut shifted: [&[[u16; SHORTS]]; SIDE] = [&[]; SIDE];
         for k in 0..SIDE {
-            shifted[k] = in_groups(&self.sums[line % 2], k, groups);
+            shifted[k] = in_groups(&self.sums, line % 2 * self.stride + k, groups);
         }
+        let [forward, backward] = matches;
+        let here = in_groups_mut(&mut forward.limit, at[0], groups);
+        let there = in_groups_mut(&mut backward.limit, at[1], groups);
         for group in 0..groups {
             let mut costs = S::load(&shifted[0][group]);
             for k in 1..SIDE {
                 costs = costs.add(S::load(&shifted[k][group]));
             }
             let column = group * SHORTS;
-            let inside = u32::MAX >> SHORTS.saturating_sub(self.columns - column);
-            let better = [
-                costs.below(S::load(&in_groups(&matches[0].limit, at[0] + column, 1)[0])) & inside,
-                costs.below(S::load(&in_groups(&matches[1].limit, at[1] + column, 1)[0])) & inside,
-            ];
-            if better[0] | better[1] == 0 {
+            let inside = u16::MAX >> SHORTS.saturating_sub(self.columns - column);
+            let better_here = costs.below(S::load(&here[group])) & inside;
+            let better_there = costs.below(S::load(&there[group])) & inside;
+            if better_here | better_there == 0 {
                 continue;
             }
             let mut values = [0; SHORTS];
             costs.store(&mut values);
-            for way in 0..2 {
-                matches[way].take(at[way] + column, better[way], &values, labels[way]);
-            }
+            let bests = [&mut forward.best[at[0] + column..], &mut backward.best[at[1] + column..]];
+            let [best_here, best_there] = bests;
+            take(best_here, &mut here[group], better_here, &values, labels[0]);
+            take(best_there, &mut there[group], better_there, &values, labels[1]);
         }
     }
+}
+
+/// Compares those pixels of a group whose bits are set.
+#[inline(always)]
+fn take(best: &mut [u64], limit: &mut [u16; SHORTS], mut bits: u16, costs: &[u16; SHORTS], label: u32) {
+    while bits != 0 {
+        let lane = bits.trailing_zeros() as usize;
+        bits &= bits - 1;
+        let offered = u64::from(costs[lane]) << u32::BITS | u64::from(label);
+        if offered < best[lane] {
+            best[lane] = offered;
+            limit[lane] = if costs[lane] == 0 { 0 } else { costs[lane] + 1 };
+        }
+    }
+}
+
+/// The numbers from `first` on, in groups, to be written.
+#[inline(always)]
+fn in_groups_mut<T>(values: &mut [T], first: usize, groups: usize) -> &mut [[T; SHORTS]] {
+    &mut values[first..first + groups * SHORTS].as_chunks_mut().0[..groups]
 }
 
 /// The numbers from `first` on, in groups.
