@@ -121,7 +121,7 @@ impl<const C: usize> Prepared<C> {
     fn of(planes: &Planes<C>) -> Self {
         let (width, height) = (planes.width, planes.height);
         let stride = width + 2 * RADIUS;
-        let channels = planes.high_passed(HIGH_PASS_RADIUS).interiors().map(|channel| {
+        let channels = planes.high_passed(HIGH_PASS_RADIUS).map(|channel| {
             let box3 = box_mean(&channel, width, height, 1);
             let mut shorts = Vec::with_capacity(stride * (height + 2 * RADIUS) + 2 * SHORTS);
             for y in 0..height + 2 * RADIUS {
@@ -145,7 +145,7 @@ impl<const C: usize> Prepared<C> {
 fn displacements_by_length(radius_x: usize, radius_y: usize) -> Vec<[i32; 2]> {
     let (rx, ry) = (radius_x as i32, radius_y as i32);
     let mut all: Vec<[i32; 2]> = (-ry..=ry).flat_map(|dy| (-rx..=rx).map(move |dx| [dx, dy])).collect();
-    all.sort_by_key(length_first);
+    all.sort_unstable_by_key(length_first);
     all
 }
 

@@ -84,10 +84,9 @@ pub fn pair_flow(
 
 /// The flow at the resolution of the images, `scale` times that of the field; bilinear.
 fn enlarged(flow: &Flow, (width, height): (u32, u32), scale: f32) -> DenseFlow {
-    let mut displacement = Vec::with_capacity(width as usize * height as usize);
-    let mut row = vec![[0.0; 2]; width as usize];
+    let mut displacement = vec![[0.0; 2]; width as usize * height as usize];
     let mut line = [(); 2].map(|()| vec![0.0f32; flow.width]);
-    for y in 0..height {
+    for (y, row) in displacement.chunks_exact_mut(width as usize).enumerate() {
         let at = ((y as f32 + 0.5) / scale - 0.5).clamp(0.0, (flow.height - 1) as f32);
         let (upper, share) = (at as usize, at.fract());
         let lower = (upper + 1).min(flow.height - 1);
@@ -103,12 +102,11 @@ fn enlarged(flow: &Flow, (width, height): (u32, u32), scale: f32) -> DenseFlow {
         let [u, v] = &line;
         // Loops of these lengths unroll.
         match scale as usize {
-            2 => stretch([u, v], 2, &mut row),
-            4 => stretch([u, v], 4, &mut row),
-            8 => stretch([u, v], 8, &mut row),
-            scale => stretch([u, v], scale, &mut row),
+            2 => stretch([u, v], 2, row),
+            4 => stretch([u, v], 4, row),
+            8 => stretch([u, v], 8, row),
+            scale => stretch([u, v], scale, row),
         }
-        displacement.extend_from_slice(&row);
     }
     DenseFlow { width, height, displacement }
 }

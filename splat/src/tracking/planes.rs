@@ -141,7 +141,11 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
 
     /// The channels without the border.
     pub(super) fn interiors(&self) -> [Vec<f32>; CHANNELS] {
-        std::array::from_fn(|channel| (0..self.height).flat_map(|y| self.row(channel, y)).copied().collect())
+        std::array::from_fn(|channel| {
+            let mut values = Vec::with_capacity(self.width * self.height);
+            (0..self.height).for_each(|y| values.extend_from_slice(self.row(channel, y)));
+            values
+        })
     }
 
     /// Half the size, each pixel the mean of four; an odd last row or column is replicated.
@@ -173,13 +177,13 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
     }
 
     /// The image minus its mean over windows of `2 * radius + 1` pixels: what is left of shading and exposure
-    /// changes is small.
-    pub(super) fn high_passed(&self, radius: usize) -> Self {
-        let interiors = self.interiors().map(|interior| {
-            let mean = box_mean(&interior, self.width, self.height, radius);
-            interior.iter().zip(&mean).map(|(value, mean)| value - mean).collect()
-        });
-        Self::from_interiors(self.width, self.height, interiors)
+    /// changes is small. Without the border.
+    pub(super) fn high_passed(&self, radius: usize) -> [Vec<f32>; CHANNELS] {
+        self.interiors().map(|mut values| {
+            let mean = box_mean(&values, self.width, self.height, radius);
+            values.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= mean);
+            values
+        })
     }
 
     /// The colour at fractional pixel index `(x, y)`, bilinear; outside is the border.

@@ -104,7 +104,7 @@ impl TrackingSettings {
         match quality {
             Quality::Draft => Self {
                 sigma_floor: 0.018,
-                max_side: 400,
+                max_side: 160,
                 search_side: 80,
                 gaps: vec![1],
                 patch_side: 200,
