@@ -136,3 +136,43 @@ impl Shorts for Avx2Shorts {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::{Instructions, Simd, simd_kernel};
+
+    type Results = [[u16; SHORTS]; 5];
+
+    simd_kernel! { fn operate(a: &[u16; SHORTS], b: &[u16; SHORTS], results: &mut Results) = operate_kernel }
+
+    #[inline(always)]
+    fn operate_kernel<S: Simd>(a: &[u16; SHORTS], b: &[u16; SHORTS], results: &mut Results) {
+        let (x, y) = (S::Shorts::load(a), S::Shorts::load(b));
+        x.add(y).store(&mut results[0]);
+        x.add(y).sub(y).store(&mut results[1]);
+        x.min(y).store(&mut results[2]);
+        x.squared_difference(y).store(&mut results[3]);
+        S::Shorts::splat(x.below(y)).store(&mut results[4]);
+    }
+
+    #[test]
+    fn every_instruction_set_computes_exactly() {
+        for n in 0..100u32 {
+            // Sums below 32 768, differences of either sign.
+            let a: [u16; SHORTS] =
+                std::array::from_fn(|lane| (n * 5003 + lane as u32 * 3701) as u16 % 20_000);
+            let b: [u16; SHORTS] =
+                std::array::from_fn(|lane| (n * 2003 + lane as u32 * 7919) as u16 % 12_700);
+            let below = (0..SHORTS).map(|lane| u16::from(a[lane] < b[lane]) << lane).sum();
+            let each = |of: fn(u16, u16) -> u16| std::array::from_fn(|lane| of(a[lane], b[lane]));
+            let square = |a: u16, b: u16| (u32::from(a.abs_diff(b)).pow(2) >> 16) as u16;
+            let expected: Results = [each(|a, b| a + b), a, each(u16::min), each(square), [below; SHORTS]];
+            for instructions in Instructions::available() {
+                let mut results = [[0; SHORTS]; 5];
+                operate(instructions, &a, &b, &mut results);
+                assert_eq!(results, expected, "{}", instructions.set());
+            }
+        }
+    }
+}

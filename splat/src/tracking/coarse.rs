@@ -1,8 +1,8 @@
 //! Exhaustive search on a small image: finds displacements that no pyramid can follow.
 //!
 //! One cost volume serves both directions: the best match of `x` in the second image and the best match of `y` in
-//! the first are the minima over the same costs. Values are shorts and costs whole numbers, so all instruction sets find
-//! the same.
+//! the first are the minima over the same costs. Costs are whole numbers, so all instruction sets find the same.
+//! Cameras stand still: only the rectangle in which the images differ is searched, the rest is matched where it is.
 
 use super::{flow::Flow, planes::Planes, windows::box_mean};
 use crate::simd::{Instructions, SHORTS, Shorts, Simd, simd_kernel};
@@ -75,7 +75,8 @@ impl Best {
 
 /// Compares every pixel's window with all windows at most `radius` pixels away along either axis.
 ///
-/// Of equal costs the smallest displacement wins, so identical images match at zero.
+/// Of equal costs the smallest displacement wins, so identical images match at zero. Outside the rectangle around all
+/// windows that differ by more than noise everything rests.
 pub(super) fn search<const C: usize>(
     instructions: Instructions,
     first: &Planes<C>,
@@ -366,19 +367,114 @@ mod tests {
 
     use super::*;
 
+    fn noise(seed: u64, count: usize) -> Vec<[f32; 3]> {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        (0..count).map(|_| random.random::<[f32; 3]>().map(|v| 255.0 * v)).collect()
+    }
+
+    fn planes(width: usize, height: usize, colour: impl Fn(usize, usize) -> [f32; 3]) -> Planes {
+        let channel = |c: usize| (0..width * height).map(|i| colour(i % width, i / width)[c]).collect();
+        Planes::from_interiors(width, height, [channel(0), channel(1), channel(2)])
+    }
+
+    /// A square of noise in front of a wall of noise.
+    fn square_at(x0: usize, y0: usize) -> Planes {
+        let (wall, square) = (noise(2, 61 * 43), noise(3, 12 * 12));
+        planes(61, 43, |x, y| match (x.checked_sub(x0), y.checked_sub(y0)) {
+            (Some(u @ 0..12), Some(v @ 0..12)) => square[v * 12 + u],
+            _ => wall[y * 61 + x],
+        })
+    }
+
+    /// Every window of the first image against every one of the second, one number at a time: the best displacement.
+    fn best_matches(first: &Prepared<3>, second: &Prepared<3>, radius: i32) -> Vec<[i32; 2]> {
+        let (width, height) = (first.width as i32, first.height as i32);
+        let value = |image: &Prepared<3>, c: usize, x: i32, y: i32| {
+            let at = (y + RADIUS as i32) * image.stride as i32 + x + RADIUS as i32;
+            i32::from(image.channels[c][at as usize])
+        };
+        let window = -(RADIUS as i32)..=RADIUS as i32;
+        let cost = |x: i32, y: i32, [dx, dy]: [i32; 2]| -> u32 {
+            let pixel = |x: i32, y: i32| {
+                let square =
+                    |c| (value(first, c, x, y) - value(second, c, x + dx, y + dy)).pow(2) as u32 >> 16;
+                (0..3).map(square).sum::<u32>().min(u32::from(MOST))
+            };
+            window
+                .clone()
+                .flat_map(|v| window.clone().map(move |u| (u, v)))
+                .map(|(u, v)| pixel(x + u, y + v))
+                .sum()
+        };
+        let best = |x: i32, y: i32| {
+            let inside =
+                |[dx, dy]: &[i32; 2]| (0..width).contains(&(x + dx)) && (0..height).contains(&(y + dy));
+            let all = displacements_by_length(radius as usize, radius as usize).into_iter().filter(inside);
+            all.min_by_key(|&displacement| cost(x, y, displacement)).unwrap_or_default()
+        };
+        (0..width * height).map(|i| best(i % width, i / width)).collect()
+    }
+
+    #[test]
+    fn the_search_agrees_with_one_number_at_a_time_on_every_instruction_set() {
+        // Everything changes, so everything is searched; sizes and windows are no whole groups.
+        let (wide, other) = (noise(4, 80 * 60), noise(5, 80 * 60));
+        let first = planes(37, 21, |x, y| wide[y * 80 + x + 9]);
+        let second = planes(37, 21, |x, y| if x < 20 { wide[(y + 3) * 80 + x] } else { other[y * 80 + x] });
+        let (a, b) = (Prepared::of(&first), Prepared::of(&second));
+        let (there, back) = (best_matches(&a, &b, 11), best_matches(&b, &a, 11));
+        for instructions in Instructions::available() {
+            let matches = search(instructions, &first, &second, 11);
+            for (found, best, other) in
+                [(&matches.forward, &there, &back), (&matches.backward, &back, &there)]
+            {
+                for (i, &[dx, dy]) in best.iter().enumerate() {
+                    let [bx, by] = other[(i as i32 + dy * 37 + dx) as usize];
+                    let leads_back = (dx + bx).abs() <= 1 && (dy + by).abs() <= 1;
+                    assert_eq!(found.u[i].is_finite(), leads_back, "{} {i}", instructions.set());
+                    if leads_back {
+                        assert_eq!([found.u[i], found.v[i]], [dx as f32, dy as f32]);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn leaving_out_what_rests_loses_no_match() {
+        let (first, second) = (square_at(6, 8), square_at(29, 20));
+        let (a, b) = (Prepared::of(&first), Prepared::of(&second));
+        let (there, back) = (best_matches(&a, &b, 25), best_matches(&b, &a, 25));
+        let found = search(Instructions::detect(), &first, &second, 25).forward;
+        let mut jumped = 0;
+        for (i, &[dx, dy]) in there.iter().enumerate() {
+            let [bx, by] = back[(i as i32 + dy * 61 + dx) as usize];
+            if (dx + bx).abs() <= 1 && (dy + by).abs() <= 1 {
+                assert_eq!([found.u[i], found.v[i]], [dx as f32, dy as f32], "{i}");
+                jumped += usize::from([dx, dy] == [23, 12]);
+            }
+        }
+        // Windows that lie inside the square see nothing else.
+        assert!(jumped >= 8 * 8, "{jumped}");
+    }
+
+    #[test]
+    fn only_the_rectangle_of_what_differs_is_searched() {
+        let mut best = Best::new(7 * 5);
+        best.limit.fill(AT_REST);
+        assert_eq!(best.not_at_rest(7).columns * best.not_at_rest(7).rows, 0);
+        best.limit[7 + 4] = AT_REST + 1;
+        best.limit[3 * 7 + 2] = AT_REST + 1;
+        assert_eq!(best.not_at_rest(7), Region { first_column: 2, first_row: 1, columns: 3, rows: 3 });
+        best.limit.fill(i16::MAX as u16);
+        assert_eq!(best.not_at_rest(7), Region { first_column: 0, first_row: 0, columns: 7, rows: 5 });
+    }
+
     #[test]
     fn shifts_up_to_the_radius_are_found_both_ways() {
         let (width, height) = (40, 30);
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(1);
-        let wide: Vec<[f32; 3]> =
-            (0..100 * 100).map(|_| random.random::<[f32; 3]>().map(|v| 255.0 * v)).collect();
-        let crop = |x0: usize, y0: usize| {
-            let channel = |c: usize| {
-                let at = |i: usize| wide[(y0 + i / width) * 100 + x0 + i % width][c];
-                (0..width * height).map(at).collect()
-            };
-            Planes::from_interiors(width, height, [channel(0), channel(1), channel(2)])
-        };
+        let wide = noise(1, 100 * 100);
+        let crop = |x0: usize, y0: usize| planes(width, height, |x, y| wide[(y0 + y) * 100 + x0 + x]);
         let matches = search(Instructions::detect(), &crop(30, 30), &crop(19, 36), 12);
         let (mut right, mut all) = (0, 0);
         for y in 10..height - 10 {

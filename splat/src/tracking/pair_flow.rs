@@ -129,3 +129,29 @@ fn stretch([u, v]: [&[f32]; 2], scale: usize, row: &mut [[f32; 2]]) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn enlarging_interpolates_between_the_centres_and_stays_flat_beyond() {
+        for (scale, size) in
+            [(1, (3, 2)), (2, (5, 4)), (2, (6, 3)), (4, (9, 7)), (8, (24, 9)), (16, (40, 17))]
+        {
+            let (width, height) = (size.0 as usize, size.1 as usize);
+            let mut flow = Flow::zeros(width.div_ceil(scale), height.div_ceil(scale));
+            for i in 0..flow.u.len() {
+                (flow.u[i], flow.v[i]) = ((i * 7 % 5) as f32, (i * 3 % 11) as f32);
+            }
+            let large = enlarged(&flow, size, scale as f32);
+            for (i, found) in large.displacement.iter().enumerate() {
+                let centre = [i % width, i / width].map(|at| (at as f32 + 0.5) / scale as f32 - 0.5);
+                let exact = flow.sample(centre[0], centre[1]).map(|value| scale as f32 * value);
+                // Values up to 160, rounded a few times each.
+                let error = (found[0] - exact[0]).abs().max((found[1] - exact[1]).abs());
+                assert!(error < 1e-4, "{scale} {size:?} {i}: {found:?} {exact:?}");
+            }
+        }
+    }
+}
