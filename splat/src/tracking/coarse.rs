@@ -286,7 +286,7 @@ impl WindowSums {
         }
         let row = in_groups_mut(&mut self.squares, line % SIDE * self.stride, groups);
         let (even, odd) = self.sums.split_at_mut(self.stride);
-        let (before, after) = if line % 2 == 0 { (odd, even) } else { (even, odd) };
+        let (before, after) = if line.is_multiple_of(2) { (odd, even) } else { (even, odd) };
         let (before, after) = (in_groups(before, 0, groups), in_groups_mut(after, 0, groups));
         for group in 0..groups {
             let mut squares = S::splat(0);

@@ -52,6 +52,7 @@ fn add_finite_kernel<S: Simd>(values: &[f32], sums: &mut [f32]) {
 
 impl<const CHANNELS: usize> Planes<CHANNELS> {
     /// Adds the border to channels of `height * width` values.
+    #[cfg(test)]
     pub(super) fn from_interiors(width: usize, height: usize, interiors: [Vec<f32>; CHANNELS]) -> Self {
         Self::from_rows(width, height, |channel, y, row| {
             row.copy_from_slice(&interiors[channel][y * width..(y + 1) * width]);

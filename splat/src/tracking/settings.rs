@@ -38,7 +38,7 @@ pub struct TrackingSettings {
     #[serde(deserialize_with = "range::whole::<0, 65_536, _>")]
     pub patch_side: u32,
     /// Distance of neighbouring patches at the full resolution of the pyramid, pixels; half of it, rounded up, at all
-    /// others; 1 to 8, default 3, with `draft` 4, with `best` 2.
+    /// others; 1 to 8, default 3, with `draft` 5, with `best` 2.
     #[serde(deserialize_with = "range::whole::<1, 8, _>")]
     pub patch_stride: u32,
     /// Descent steps per patch and level; 1 to 1000, default 8, with `best` 16.
@@ -110,7 +110,7 @@ impl TrackingSettings {
                 search_side: 80,
                 gaps: vec![1],
                 patch_side: 200,
-                patch_stride: 4,
+                patch_stride: 5,
                 smoothing_warps: 1,
                 ..balanced
             },
