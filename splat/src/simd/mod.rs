@@ -8,6 +8,7 @@
 mod doubles;
 mod instructions;
 mod plain;
+mod shorts;
 #[cfg(test)]
 mod tests;
 #[cfg(target_arch = "x86_64")]
@@ -16,6 +17,7 @@ mod x86;
 pub(crate) use self::doubles::{Doubles, OCTET};
 pub use self::instructions::{InstructionSet, Instructions, Unavailable};
 pub(crate) use self::plain::Plain;
+pub(crate) use self::shorts::{SHORTS, Shorts};
 #[cfg(target_arch = "x86_64")]
 pub(crate) use self::x86::{Avx2, Avx512};
 
@@ -40,6 +42,8 @@ pub(crate) trait Simd: Copy {
     type Mask: Copy;
     /// Double precision with the same instructions.
     type Doubles: Doubles;
+    /// 16-bit whole numbers with the same instructions.
+    type Shorts: Shorts;
     fn splat(value: f32) -> Self;
     fn load(from: &[f32; LANES]) -> Self;
     fn store(self, to: &mut [f32; LANES]);

@@ -1,6 +1,6 @@
 //! Plain arrays.
 
-use super::{LANES, ROWS, Simd, doubles::PlainDoubles};
+use super::{LANES, ROWS, Simd, doubles::PlainDoubles, shorts::PlainShorts};
 
 /// Plain arrays, for machines without the instruction sets below and for reference.
 #[derive(Clone, Copy)]
@@ -16,6 +16,7 @@ impl Plain {
 impl Simd for Plain {
     type Mask = [bool; LANES];
     type Doubles = PlainDoubles;
+    type Shorts = PlainShorts;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self([value; LANES])

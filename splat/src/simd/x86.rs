@@ -5,6 +5,7 @@ use std::arch::x86_64::*;
 use super::{
     LANES, Plain, ROWS, Simd,
     doubles::{Avx2Doubles, Avx512Doubles},
+    shorts::Avx2Shorts,
 };
 
 /// One 512-bit register.
@@ -27,6 +28,8 @@ macro_rules! intrinsic {
 impl Simd for Avx512 {
     type Mask = __mmask16;
     type Doubles = Avx512Doubles;
+    // Unaligned loads of 512 bits always touch two lines of the cache.
+    type Shorts = Avx2Shorts;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self(intrinsic!(_mm512_set1_ps(value)))
@@ -217,6 +220,7 @@ impl Avx2 {
 impl Simd for Avx2 {
     type Mask = (__m256, __m256);
     type Doubles = Avx2Doubles;
+    type Shorts = Avx2Shorts;
     #[inline(always)]
     fn splat(value: f32) -> Self {
         let half = intrinsic!(_mm256_set1_ps(value));

@@ -31,7 +31,8 @@ impl<const C: usize> Level<C> {
     pub(super) fn pyramid(finest: Planes<C>, settings: &TrackingSettings) -> Vec<Self> {
         let level = |planes: Planes<C>| {
             // What shading takes from differences it takes from their derivatives.
-            let texels = Texels::new(&planes, &planes.high_passed(SHADING_RADIUS));
+            let shaded = planes.high_passed(SHADING_RADIUS);
+            let texels = Texels::new(&planes, &Planes::from_interiors(planes.width, planes.height, shaded));
             let similarity = similarity(&planes);
             Self { planes: Arc::new(planes), texels, similarity }
         };

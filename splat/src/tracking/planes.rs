@@ -1,7 +1,10 @@
 //! Channels of an image with a replicated border, and their pyramid.
 
 use super::windows::box_mean;
-use crate::image::Image;
+use crate::{
+    image::Image,
+    simd::{Instructions, Simd, simd_kernel},
+};
 
 /// Side of a patch, pixels. A constant, so that the loops over a patch have a known length and vectorise.
 pub(super) const PATCH: usize = 8;
@@ -34,9 +37,17 @@ impl Planes<1> {
     }
 }
 
-fn grey_levels(value: f32) -> f32 {
-    let value = if value.is_finite() { value } else { 0.0 };
-    255.0 * value.clamp(-4.0, 4.0)
+simd_kernel! {
+    /// Adds a row to sums, neither what is not finite nor what is beyond any exposure.
+    fn add_finite(values: &[f32], sums: &mut [f32]) = add_finite_kernel
+}
+
+#[inline(always)]
+fn add_finite_kernel<S: Simd>(values: &[f32], sums: &mut [f32]) {
+    for (sum, &value) in sums.iter_mut().zip(values) {
+        let value = if value.is_finite() { value } else { 0.0 };
+        *sum += value.clamp(-4.0, 4.0);
+    }
 }
 
 impl<const CHANNELS: usize> Planes<CHANNELS> {
@@ -80,26 +91,30 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
         let [image_width, image_height] = [image.width as usize, image.height as usize];
         let side = 1 << halvings;
         let (width, height) = (image_width.div_ceil(side), image_height.div_ceil(side));
+        let instructions = Instructions::detect();
         let mut line = vec![[0.0f32; 3]; width * side];
         let mut sums = vec![[0.0f32; CHANNELS]; width * height];
-        for y in 0..height * side {
-            let from = 3 * image_width * y.min(image_height - 1);
-            let values = &image.pixels[from..from + 3 * image_width];
-            let levels = line[..image_width].as_flattened_mut();
-            levels.iter_mut().zip(values).for_each(|(level, &value)| *level = grey_levels(value));
+        for (y, sums) in sums.chunks_exact_mut(width).enumerate() {
+            // Down the columns first: most of the work is adding whole rows.
+            line.fill([0.0; 3]);
+            for row in y * side..(y + 1) * side {
+                let from = 3 * image_width * row.min(image_height - 1);
+                let values = &image.pixels[from..from + 3 * image_width];
+                add_finite(instructions, values, line[..image_width].as_flattened_mut());
+            }
             let last = line[image_width - 1];
             line[image_width..].fill(last);
-            let sums = &mut sums[y / side * width..][..width];
             for (sum, block) in sums.iter_mut().zip(line.chunks_exact(side)) {
-                for &colour in block {
-                    let mixed = mix(colour);
-                    for (sum, value) in sum.iter_mut().zip(mixed) {
-                        *sum += value;
+                let mut total = [0.0; 3];
+                for colour in block {
+                    for c in 0..3 {
+                        total[c] += colour[c];
                     }
                 }
+                *sum = mix(total);
             }
         }
-        let share = 1.0 / (side * side) as f32;
+        let share = 255.0 / (side * side) as f32;
         Self::from_rows(width, height, |channel, y, row| {
             for (value, sum) in row.iter_mut().zip(&sums[y * width..]) {
                 *value = share * sum[channel];
@@ -126,7 +141,11 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
 
     /// The channels without the border.
     pub(super) fn interiors(&self) -> [Vec<f32>; CHANNELS] {
-        std::array::from_fn(|channel| (0..self.height).flat_map(|y| self.row(channel, y)).copied().collect())
+        std::array::from_fn(|channel| {
+            let mut values = Vec::with_capacity(self.width * self.height);
+            (0..self.height).for_each(|y| values.extend_from_slice(self.row(channel, y)));
+            values
+        })
     }
 
     /// Half the size, each pixel the mean of four; an odd last row or column is replicated.
@@ -158,13 +177,13 @@ impl<const CHANNELS: usize> Planes<CHANNELS> {
     }
 
     /// The image minus its mean over windows of `2 * radius + 1` pixels: what is left of shading and exposure
-    /// changes is small.
-    pub(super) fn high_passed(&self, radius: usize) -> Self {
-        let interiors = self.interiors().map(|interior| {
-            let mean = box_mean(&interior, self.width, self.height, radius);
-            interior.iter().zip(&mean).map(|(value, mean)| value - mean).collect()
-        });
-        Self::from_interiors(self.width, self.height, interiors)
+    /// changes is small. Without the border.
+    pub(super) fn high_passed(&self, radius: usize) -> [Vec<f32>; CHANNELS] {
+        self.interiors().map(|mut values| {
+            let mean = box_mean(&values, self.width, self.height, radius);
+            values.iter_mut().zip(&mean).for_each(|(value, mean)| *value -= mean);
+            values
+        })
     }
 
     /// The colour at fractional pixel index `(x, y)`, bilinear; outside is the border.

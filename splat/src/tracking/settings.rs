@@ -14,11 +14,12 @@ pub struct TrackingSettings {
     #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
     pub full_side: u32,
     /// Images are halved until their longer side is at most this many pixels; 16 to 65 536, default 800, with `draft`
-    /// 400, with `best` 1600.
+    /// 160, with `best` 1600.
     #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
     pub max_side: u32,
     /// Images of the exhaustive search are halved until their longer side is at most this many pixels; 16 to 256,
-    /// default 100, with `draft` 80. Its time grows with the fourth power.
+    /// default 100, with `draft` 80. Its time grows with the fourth power, and with the square of the area that changes
+    /// between two frames.
     #[serde(deserialize_with = "range::whole::<16, 256, _>")]
     pub search_side: u32,
     /// Largest displacement between two frames along either axis that the exhaustive search finds, as a fraction of the
@@ -37,7 +38,7 @@ pub struct TrackingSettings {
     #[serde(deserialize_with = "range::whole::<0, 65_536, _>")]
     pub patch_side: u32,
     /// Distance of neighbouring patches at the full resolution of the pyramid, pixels; half of it, rounded up, at all
-    /// others; 1 to 8, default 3, with `draft` 4, with `best` 2.
+    /// others; 1 to 8, default 3, with `draft` 5, with `best` 2.
     #[serde(deserialize_with = "range::whole::<1, 8, _>")]
     pub patch_stride: u32,
     /// Descent steps per patch and level; 1 to 1000, default 8, with `best` 16.
@@ -62,7 +63,8 @@ pub struct TrackingSettings {
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
     #[serde(deserialize_with = "range::correlation")]
     pub correlation: f32,
-    /// Standard deviation that no track goes below, pixels; above 0, default 0.008, with `draft` 0.018.
+    /// Standard deviation that no track goes below, pixels; above 0, default 0.008; of the resolution that is matched, so
+    /// that the images' pixels are as often more as they were halved.
     #[serde(deserialize_with = "range::distance")]
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
@@ -103,12 +105,11 @@ impl TrackingSettings {
         };
         match quality {
             Quality::Draft => Self {
-                sigma_floor: 0.018,
-                max_side: 400,
+                max_side: 160,
                 search_side: 80,
                 gaps: vec![1],
                 patch_side: 200,
-                patch_stride: 4,
+                patch_stride: 5,
                 smoothing_warps: 1,
                 ..balanced
             },

@@ -1,23 +1,6 @@
 //! Sums and means over square windows.
 
-use crate::simd::{Instructions, LANES, Simd, simd_kernel};
-
-/// A group of lanes from `first` on.
-#[inline(always)]
-pub(super) fn lanes(values: &[f32], first: usize) -> &[f32; LANES] {
-    values[first..].first_chunk().unwrap_or_else(|| too_short())
-}
-
-/// The same, to be written.
-#[inline(always)]
-pub(super) fn lanes_mut(values: &mut [f32], first: usize) -> &mut [f32; LANES] {
-    values[first..].first_chunk_mut().unwrap_or_else(|| too_short())
-}
-
-#[cold]
-fn too_short() -> ! {
-    unreachable!("rows that are read in groups have a group to spare")
-}
+use crate::simd::{Instructions, Simd, simd_kernel};
 
 /// Sum over windows of `2 * radius + 1` columns and rows, cut at the image's edge.
 pub(super) fn box_sum(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
