@@ -1,33 +1,52 @@
 //! Track fields from the key frame to every frame, per training view. Once per clip.
 //!
-//! Own tracks are tasks like frames: workers take them view by view, and the coordinator where no worker may. A frame is
-//! published as soon as every view is tracked to it, so that it is refined while later ones are tracked.
+//! Own tracks are tasks like frames: workers take them view by view, and the coordinator where no worker may. They need
+//! the images only, so workers begin with them while the static model is made. After that a frame is published as soon as
+//! every view is tracked to it, so that it is refined while later ones are tracked.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, future::pending, sync::Arc};
 
 use prost::Message;
 use splat::settings::MotionSource;
+use tokio::sync::watch;
 use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
 use super::{Job, frames::FrameWork};
 use crate::{
     failure::StageError,
+    hub::Hub,
     keys::{TrackKey, VERSION, digest_of},
     ledger::{Field, TrackLedger, TrackedView},
     model,
+    queue::JobId,
     request::{InputFile, TrackSource},
     store::ViewRecord,
 };
 
 impl Job {
+    /// Makes the static model while workers track.
+    pub(super) async fn make_static_model_beside_tracks(&mut self) -> Result<(), StageError> {
+        if !self.is_tracked() || self.frames.len() < 2 || self.imports_tracks() {
+            return self.make_static_model().await;
+        }
+        self.offer_tracks().await?;
+        let failed = tracks_failed(self.hub.clone(), self.id.clone(), self.changed.clone());
+        tokio::select! {
+            made = self.make_static_model() => made,
+            reason = failed => Err(reason),
+        }
+    }
+
     pub(super) async fn track(&mut self) -> Result<(), StageError> {
-        if !self.is_tracked() || self.frames.len() < 2 {
-            return Ok(());
+        match self.is_tracked() && self.frames.len() >= 2 {
+            false => Ok(()),
+            true if self.imports_tracks() => self.import_tracks().await,
+            true => self.compute_tracks().await,
         }
-        match self.request.tracks {
-            TrackSource::Own | TrackSource::Learned(_) => self.compute_tracks().await,
-            TrackSource::Exact(_) | TrackSource::Files(_) => self.import_tracks().await,
-        }
+    }
+
+    fn imports_tracks(&self) -> bool {
+        matches!(self.request.tracks, TrackSource::Exact(_) | TrackSource::Files(_))
     }
 
     /// Whether the frames of this job start from tracks.
@@ -37,11 +56,19 @@ impl Job {
 
     async fn compute_tracks(&mut self) -> Result<(), StageError> {
         let work = self.frame_work().await?;
-        let ledger = self.ledger().await?;
-        self.hub.begin_tracks(&self.id, &self.stop, ledger).await?;
+        self.offer_tracks().await?;
         tokio::try_join!(self.publish_tracked(&work), self.track_alone())?;
         self.published = self.frames.len();
         Ok(())
+    }
+
+    /// Views that lack fields become ready for workers, once in a run.
+    async fn offer_tracks(&self) -> Result<(), StageError> {
+        if self.hub.has_tracks(&self.id).await {
+            return Ok(());
+        }
+        let ledger = self.ledger().await?;
+        self.hub.begin_tracks(&self.id, &self.stop, ledger).await
     }
 
     /// Publishes every frame, in order, once all views are tracked to it.
@@ -136,5 +163,18 @@ impl Job {
         let clip = &self.record.clip_digest;
         let frames = &self.frames[..=index];
         Ok(digest_of(&TrackKey { kind: "imported tracks", version: VERSION, source, clip, frames, view }))
+    }
+}
+
+/// Why a view cannot be tracked, once one cannot. A run that is stopped meanwhile ends by itself.
+async fn tracks_failed(hub: Arc<Hub>, id: JobId, mut changed: watch::Receiver<()>) -> StageError {
+    loop {
+        changed.borrow_and_update();
+        if let Err(error @ StageError::Failed(_)) = hub.tracks(&id, |_| ()).await {
+            return error;
+        }
+        if changed.changed().await.is_err() {
+            return pending().await;
+        }
     }
 }

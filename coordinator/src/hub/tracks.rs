@@ -53,6 +53,11 @@ impl Hub {
         Ok(self.dispatch(&mut desk).await?)
     }
 
+    /// Whether views have become ready in this run of the job.
+    pub(crate) async fn has_tracks(&self, job: &JobId) -> bool {
+        self.desk.lock().await.ledger(job).is_some()
+    }
+
     /// Fields that an earlier attempt or another job has made complete a view without a lease.
     async fn settle_tracks(&self, job: &JobId, position: u32) -> Result<(), StageError> {
         let key = TaskKey { job: job.clone(), task: Task::Tracks(position) };

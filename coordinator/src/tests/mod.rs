@@ -1,5 +1,6 @@
 //! The coordinator over loopback, with workers that speak the protocol by hand.
 
+mod early_tracks;
 mod harness;
 mod jobs;
 mod learned;
