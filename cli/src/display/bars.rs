@@ -17,7 +17,7 @@ pub(super) struct Bars {
     stage: ProgressBar,
     frames: ProgressBar,
     running: BTreeMap<String, ProgressBar>,
-    /// Whether the stage bar is of frames: handing them out is over before anybody could read it.
+    /// Of the job: decides whose progress the stage bar shows.
     state: JobState,
 }
 
@@ -41,6 +41,7 @@ impl Bars {
 
     fn progress(&mut self, progress: &Progress) {
         let task = match (progress.frame, progress.view.as_str()) {
+            // Handing frames out is over before anybody could read it.
             (0, "") if self.state == JobState::Frames => return,
             // Workers track while the static model is made, whose bar it is.
             (0, "") if self.state == JobState::StaticModel && progress.stage == "tracking" => return,
