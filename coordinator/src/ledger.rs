@@ -1,6 +1,12 @@
 //! Which track fields of a job there are, and which are still to be made: pure data, kept by the hub.
+//!
+//! Views are tracked in windows of some frames. Tracking goes on at the end of any window whose state is there; where
+//! none is, at the key frame.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    ops::Range,
+};
 
 use trackersplat_proto::v1::{Blob, Failure, TrackFrame, TrackJob, TrackedField, Tracker};
 
@@ -12,7 +18,11 @@ pub(crate) struct TrackLedger {
     job: JobId,
     tracker: Tracker,
     key_frame: u32,
+    /// Frames that a state may reach back.
+    reach: usize,
     views: BTreeMap<u32, TrackedView>,
+    /// What the last lease of each view covers.
+    leased: BTreeMap<u32, Window>,
     /// Fields that are there, and all.
     counts: (u64, u64),
     failed: Option<Failure>,
@@ -29,6 +39,29 @@ pub(crate) struct TrackedView {
     pub(crate) key_image: Blob,
     /// In order of frames, those after the key frame.
     pub(crate) fields: Vec<Field>,
+    /// Fields per window.
+    pub(crate) window: usize,
+    /// The tracker's states after every window but the last.
+    pub(crate) states: Vec<State>,
+}
+
+/// What the tracker remembers after a window.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct State {
+    /// Names the state among the artifacts.
+    pub(crate) key: String,
+    /// The state, while there is one.
+    pub(crate) blob: Option<Blob>,
+}
+
+/// What one lease covers: consecutive fields of a view.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Window {
+    number: usize,
+    /// By index.
+    fields: Range<usize>,
+    /// Whether there is more to track after it, and nothing to go on from.
+    wants_state: bool,
 }
 
 /// The tracks of one view to one frame.
@@ -40,6 +73,37 @@ pub(crate) struct Field {
     pub(crate) key: String,
     /// The field, once there is one.
     pub(crate) tracks: Option<Blob>,
+}
+
+/// Where the state belongs that a window is to leave.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct StatePlace {
+    pub(crate) key: String,
+    /// Places in the view of the frames that it may remember.
+    pub(crate) past: Range<usize>,
+}
+
+impl TrackedView {
+    /// What is to be tracked next, if anything is.
+    fn next(&self) -> Option<Window> {
+        let is_missing = |field: &Field| field.tracks.is_none();
+        let first_missing = self.fields.iter().position(is_missing)?;
+        let last_missing = self.fields.iter().rposition(is_missing)?;
+        let is_there = |number: &usize| *number == 0 || self.state(number - 1).is_some();
+        let window = self.window.max(1);
+        let number = (0..=first_missing / window).rev().find(is_there)?;
+        let start = number * window;
+        let end = (start + window).min(self.fields.len());
+        let wants_state = last_missing >= end && self.state(number).is_none();
+        // Fields that exist after the last missing one are for nobody.
+        let end = if wants_state { end } else { end.min(last_missing + 1) };
+        Some(Window { number, fields: start..end, wants_state })
+    }
+
+    /// The state after a window.
+    fn state(&self, number: usize) -> Option<&Blob> {
+        self.states.get(number)?.blob.as_ref()
+    }
 }
 
 /// Where a field belongs that is not there yet.
@@ -55,12 +119,23 @@ impl TrackLedger {
         job: JobId,
         key_frame: u32,
         tracker: Tracker,
+        reach: usize,
         views: BTreeMap<u32, TrackedView>,
     ) -> Self {
         let fields = || views.values().flat_map(|view| &view.fields);
         let held = fields().filter(|field| field.tracks.is_some()).count();
         let counts = (held as u64, fields().count() as u64);
-        Self { job, tracker, key_frame, views, counts, failed: None, adopted: BTreeSet::new() }
+        Self {
+            job,
+            tracker,
+            key_frame,
+            reach,
+            views,
+            leased: BTreeMap::new(),
+            counts,
+            failed: None,
+            adopted: BTreeSet::new(),
+        }
     }
 
     /// Positions of the views, complete or not.
@@ -79,21 +154,105 @@ impl TrackLedger {
         self.views.get(&position).map_or("", |view| view.name.as_str())
     }
 
-    /// What a worker gets; `None` if the view is not tracked.
-    pub(crate) fn task(&self, position: u32) -> Option<TrackJob> {
+    /// What a worker gets that is to go on with a view; `None` if nothing of it is to be tracked.
+    pub(crate) fn lease(&mut self, position: u32) -> Option<TrackJob> {
+        let window = self.views.get(&position)?.next()?;
+        let job = self.job_of(position, &window);
+        self.leased.insert(position, window);
+        job
+    }
+
+    fn job_of(&self, position: u32, window: &Window) -> Option<TrackJob> {
         let view = self.views.get(&position)?;
-        let key = TrackFrame { frame: self.key_frame, image: Some(view.key_image.clone()), tracks: None };
-        let later = view.fields.iter().map(|field| TrackFrame {
+        let start = window.fields.start;
+        let frame = |field: &Field| TrackFrame {
             frame: field.frame,
             image: Some(field.image.clone()),
             tracks: field.tracks.clone(),
-        });
+        };
+        let key = TrackFrame { frame: self.key_frame, image: Some(view.key_image.clone()), tracks: None };
         Some(TrackJob {
             job_id: self.job.to_string(),
             view: view.name.clone(),
             tracker: Some(self.tracker.clone()),
-            frames: std::iter::once(key).chain(later).collect(),
+            frames: std::iter::once(key)
+                .chain(view.fields[window.fields.clone()].iter().map(frame))
+                .collect(),
+            // Places count the key frame.
+            first: u32::try_from(start + 1).unwrap_or(u32::MAX),
+            state: self.begins_from(position, window).and_then(|state| state.blob.clone()),
+            past: view.fields[start.saturating_sub(self.reach)..start].iter().map(frame).collect(),
+            wants_state: window.wants_state,
         })
+    }
+
+    /// The state that a window begins from; `None` at the key frame.
+    fn begins_from(&self, position: u32, window: &Window) -> Option<&State> {
+        self.views.get(&position)?.states.get(window.number.checked_sub(1)?)
+    }
+
+    /// The frame before which a view's next window goes out: tracks are made a window ahead of the frames that need them,
+    /// those of all views in step.
+    pub(crate) fn before(&self, position: u32) -> u32 {
+        let Some(view) = self.views.get(&position) else { return 0 };
+        let next = view.next().and_then(|window| window.number.checked_sub(1));
+        next.map_or(0, |earlier| view.fields[earlier * view.window].frame)
+    }
+
+    /// The state that a view would go on from.
+    pub(crate) fn next_state(&self, position: u32) -> Option<State> {
+        let window = self.views.get(&position)?.next()?;
+        self.begins_from(position, &window).cloned()
+    }
+
+    /// The state that the leased window of a view began from.
+    pub(crate) fn leased_state(&self, position: u32) -> Option<State> {
+        self.begins_from(position, self.leased.get(&position)?).cloned()
+    }
+
+    /// What the leased window of a view still lacks.
+    pub(crate) fn lacks(&self, position: u32) -> Option<String> {
+        let (view, window) = (self.views.get(&position)?, self.leased.get(&position)?);
+        let missing = view.fields[window.fields.clone()].iter().find(|field| field.tracks.is_none());
+        if let Some(field) = missing {
+            return Some(format!("the tracks to frame {}", field.frame));
+        }
+        let lacks_state = window.wants_state && view.state(window.number).is_none();
+        lacks_state.then(|| "the tracker's state after its window".to_owned())
+    }
+
+    /// Where the state belongs that the leased window of a view is to leave; `None` if none is wanted.
+    pub(crate) fn state_place(&self, position: u32) -> Option<StatePlace> {
+        let (view, window) = (self.views.get(&position)?, self.leased.get(&position)?);
+        if !window.wants_state || view.state(window.number).is_some() {
+            return None;
+        }
+        let next = window.fields.end + 1;
+        let past = next.saturating_sub(self.reach).max(1)..next;
+        Some(StatePlace { key: view.states.get(window.number)?.key.clone(), past })
+    }
+
+    /// The state after the leased window of a view is there.
+    pub(crate) fn keep_state(&mut self, position: u32, blob: &Blob) {
+        let Some(window) = self.leased.get(&position) else { return };
+        let states = self.views.get_mut(&position).map(|view| &mut view.states);
+        if let Some(state) = states.and_then(|states| states.get_mut(window.number)) {
+            state.blob = Some(blob.clone());
+        }
+    }
+
+    /// A state is gone: what is tracked next begins before it.
+    pub(crate) fn lose_state(&mut self, position: u32, key: &str) {
+        let states = self.views.get_mut(&position).map(|view| view.states.iter_mut());
+        states.into_iter().flatten().filter(|state| state.key == key).for_each(|state| state.blob = None);
+    }
+
+    /// Takes the states of a view that nobody needs any more: those before the one to go on from.
+    pub(crate) fn take_superseded(&mut self, position: u32) -> Vec<State> {
+        let Some(view) = self.views.get_mut(&position) else { return Vec::new() };
+        let needed = view.next().map_or(usize::MAX, |window| window.number.saturating_sub(1));
+        let superseded = view.states.iter_mut().take(needed).filter(|state| state.blob.is_some());
+        superseded.map(|state| State { key: state.key.clone(), blob: state.blob.take() }).collect()
     }
 
     /// Where a field belongs; `None` if this very field is there already. Refuses a frame that the job does not have, and
@@ -165,6 +324,12 @@ impl TrackLedger {
         self.failed.as_ref()
     }
 
+    /// The tracks of one view to a frame.
+    #[cfg(test)]
+    pub(crate) fn tracks(&self, position: u32, frame: u32) -> Option<Blob> {
+        self.field(position, frame)?.tracks.clone()
+    }
+
     fn field(&self, position: u32, frame: u32) -> Option<&Field> {
         let fields = &self.views.get(&position)?.fields;
         fields.binary_search_by_key(&frame, |field| field.frame).ok().map(|index| &fields[index])
@@ -200,10 +365,12 @@ mod tests {
             size: (8, 6),
             key_image: blob("image-3"),
             fields: vec![field(4), field(6)],
+            window: 16,
+            states: Vec::new(),
         };
         let tracker = Tracker { settings_json: "{}".into(), ..Tracker::default() };
         let views = [(0, view("cam00")), (2, view("cam02"))].into();
-        TrackLedger::new("job".into(), 3, tracker, views)
+        TrackLedger::new("job".into(), 3, tracker, 2, views)
     }
 
     #[test]
@@ -229,7 +396,7 @@ mod tests {
         let message = ledger.place(0, &found(4, "other")).unwrap_err();
         assert!(message.contains("cam00") && message.contains("frame 4"), "{message}");
         ledger.keep(0, &found(4, "other"));
-        assert_eq!(ledger.task(0).unwrap().frames[1].tracks, Some(blob("a")));
+        assert_eq!(ledger.lease(0).unwrap().frames[1].tracks, Some(blob("a")));
         for (position, frame) in [(0, 3), (0, 5), (1, 4)] {
             assert!(ledger.place(position, &found(frame, "a")).is_err(), "{position} {frame}");
         }
@@ -241,7 +408,7 @@ mod tests {
         let mut ledger = ledger();
         ledger.adopt(0, 4, blob("theirs"));
         assert_eq!(
-            (ledger.task(0).unwrap().frames[1].tracks.clone(), ledger.counts()),
+            (ledger.lease(0).unwrap().frames[1].tracks.clone(), ledger.counts()),
             (Some(blob("theirs")), (1, 4))
         );
         assert_eq!(ledger.place(0, &found(4, "own")), Ok(None));
@@ -251,12 +418,96 @@ mod tests {
     fn a_task_names_what_exists_and_a_failure_its_view() {
         let mut ledger = ledger();
         ledger.keep(2, &found(6, "c"));
-        let task = ledger.task(2).unwrap();
+        let task = ledger.lease(2).unwrap();
         let frames: Vec<_> = task.frames.iter().map(|frame| (frame.frame, frame.tracks.is_some())).collect();
-        assert_eq!(frames, [(3, false), (4, false), (6, true)]);
-        assert_eq!((task.view.as_str(), ledger.task(1)), ("cam02", None));
+        assert_eq!(frames, [(3, false), (4, false)], "nobody needs frame 6 again");
+        assert_eq!((task.view.as_str(), ledger.lease(1)), ("cam02", None));
         ledger.fail(2, &failure(FailureKind::BadInput, "frame 4 is no image"));
         ledger.fail(0, &failure(FailureKind::Bug, "later"));
         assert_eq!(ledger.failed().unwrap().message, "tracks of view 'cam02': frame 4 is no image");
+    }
+
+    /// One view over frames 10, 11, … 16 in windows of two; the key frame is 10.
+    fn in_windows(reach: usize) -> TrackLedger {
+        let field = |frame: u32| Field {
+            frame,
+            image: blob(&format!("image-{frame}")),
+            key: format!("key-{frame}"),
+            tracks: None,
+        };
+        let view = TrackedView {
+            name: "cam00".into(),
+            size: (8, 6),
+            key_image: blob("image-10"),
+            fields: (11..=16).map(field).collect(),
+            window: 2,
+            states: (0..2).map(|number| State { key: format!("state-{number}"), blob: None }).collect(),
+        };
+        TrackLedger::new("job".into(), 10, Tracker::default(), reach, [(0, view)].into())
+    }
+
+    fn numbers(frames: &[TrackFrame]) -> Vec<u32> {
+        frames.iter().map(|frame| frame.frame).collect()
+    }
+
+    fn keep_leased(ledger: &mut TrackLedger, job: &TrackJob, state: Option<&str>) {
+        for frame in &job.frames[1..] {
+            ledger.keep(0, &found(frame.frame, "field"));
+        }
+        if let Some(state) = state {
+            ledger.keep_state(0, &blob(state));
+        }
+    }
+
+    #[test]
+    fn windows_follow_each_other_by_their_states() {
+        let mut ledger = in_windows(3);
+        assert_eq!(ledger.before(0), 0);
+        let first = ledger.lease(0).unwrap();
+        assert_eq!((numbers(&first.frames), first.first, first.past.len()), (vec![10, 11, 12], 1, 0));
+        assert_eq!((&first.state, first.wants_state), (&None, true));
+        assert_eq!(ledger.lacks(0).unwrap(), "the tracks to frame 11");
+        keep_leased(&mut ledger, &first, None);
+        assert!(ledger.lacks(0).unwrap().contains("state"));
+        assert_eq!(ledger.state_place(0), Some(StatePlace { key: "state-0".into(), past: 1..3 }));
+        keep_leased(&mut ledger, &first, Some("a"));
+        assert_eq!((ledger.lacks(0), ledger.state_place(0), ledger.before(0)), (None, None, 11));
+
+        let second = ledger.lease(0).unwrap();
+        assert_eq!((numbers(&second.frames), numbers(&second.past)), (vec![10, 13, 14], vec![11, 12]));
+        assert_eq!((second.first, second.state.clone(), second.wants_state), (3, Some(blob("a")), true));
+        assert_eq!(ledger.state_place(0).unwrap().past, 2..5);
+        assert_eq!(ledger.take_superseded(0), [], "it is begun from");
+        keep_leased(&mut ledger, &second, Some("b"));
+        let superseded = ledger.take_superseded(0);
+        assert_eq!(superseded, [State { key: "state-0".into(), blob: Some(blob("a")) }]);
+
+        let last = ledger.lease(0).unwrap();
+        assert_eq!((numbers(&last.frames), numbers(&last.past)), (vec![10, 15, 16], vec![12, 13, 14]));
+        assert_eq!((last.state.clone(), last.wants_state, ledger.before(0)), (Some(blob("b")), false, 13));
+        keep_leased(&mut ledger, &last, None);
+        assert_eq!((ledger.lacks(0), ledger.missing(0), ledger.lease(0)), (None, None, None));
+        assert_eq!(ledger.take_superseded(0).len(), 1);
+    }
+
+    #[test]
+    fn a_state_that_is_gone_costs_the_windows_before_it() {
+        let mut ledger = in_windows(1);
+        for state in ["a", "b"] {
+            let job = ledger.lease(0).unwrap();
+            keep_leased(&mut ledger, &job, Some(state));
+        }
+        assert_eq!(ledger.next_state(0).unwrap().key, "state-1");
+        ledger.lose_state(0, "state-1");
+        let again = ledger.lease(0).unwrap();
+        assert_eq!((again.first, again.state.clone(), again.wants_state), (3, Some(blob("a")), true));
+        assert!(again.frames[1..].iter().all(|frame| frame.tracks.is_some()), "only the state is missing");
+        assert_eq!(ledger.leased_state(0).unwrap().key, "state-0");
+        ledger.lose_state(0, "state-0");
+        assert_eq!(ledger.lease(0).unwrap().first, 1);
+        assert_eq!(ledger.leased_state(0), None);
+        ledger.keep_state(0, &blob("a"));
+        let again = ledger.lease(0).unwrap();
+        assert_eq!((again.first, again.wants_state), (3, true));
     }
 }

@@ -7,7 +7,7 @@
 use std::{collections::BTreeMap, future::pending, sync::Arc};
 
 use prost::Message;
-use splat::settings::MotionSource;
+use splat::{formats::track_state, settings::MotionSource, tracking::TrackingSettings};
 use tokio::sync::watch;
 use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
@@ -16,7 +16,7 @@ use crate::{
     failure::StageError,
     hub::Hub,
     keys::{TrackKey, VERSION, digest_of},
-    ledger::{Field, TrackLedger, TrackedView},
+    ledger::{Field, State, TrackLedger, TrackedView},
     model,
     queue::JobId,
     request::{InputFile, TrackSource},
@@ -90,7 +90,10 @@ impl Job {
 
     /// What is to be tracked, and what is in the store already.
     pub(super) async fn ledger(&self) -> Result<TrackLedger, StageError> {
-        let settings_json = serde_json::to_string(&self.settings.tracking).map_err(|error| {
+        // However views are cut, their fields are the same.
+        let window = TrackingSettings::default().window;
+        let uncut = TrackingSettings { window, ..self.settings.tracking.clone() };
+        let settings_json = serde_json::to_string(&uncut).map_err(|error| {
             StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
         })?;
         let tracker = match &self.request.tracks {
@@ -107,7 +110,8 @@ impl Job {
         for (position, view) in (0..).zip(&views).filter(|(_, view)| !view.held_out) {
             tracked.insert(position, self.tracked_view(position, view, &tracker).await?);
         }
-        Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, tracked))
+        let reach = self.settings.tracking.reach() as usize;
+        Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, reach, tracked))
     }
 
     /// The network in the store, where workers find it.
@@ -134,7 +138,10 @@ impl Job {
             let message = format!("the stored images of view '{}' are gone; submit the job again", view.name);
             StageError::new(FailureKind::Transient, message)
         })?;
-        let mut fields = Vec::new();
+        let size = (view.camera.width, view.camera.height);
+        let window = self.window(size);
+        let (mut fields, mut states) = (Vec::new(), Vec::new());
+        let last = images.len();
         // A network is known by its bytes, whatever its file is called.
         let nameless = Tracker { model_name: String::new(), ..tracker.clone() };
         let tracker = blake3::hash(&nameless.encode_to_vec()).to_hex().to_string();
@@ -152,9 +159,20 @@ impl Job {
             };
             let tracks: Option<Blob> = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
             fields.push(Field { frame, image, key, tracks });
+            if index % window == 0 && index < last {
+                let key = digest_of(&("track state", VERSION, &own_key));
+                let blob = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
+                states.push(State { key, blob });
+            }
         }
-        let size = (view.camera.width, view.camera.height);
-        Ok(TrackedView { name: view.name.clone(), size, key_image, fields })
+        Ok(TrackedView { name: view.name.clone(), size, key_image, fields, window, states })
+    }
+
+    /// Frames per lease of views of a size. Views whose states would be too large for a blob are not cut.
+    fn window(&self, (width, height): (u32, u32)) -> usize {
+        let tracking = &self.settings.tracking;
+        let state = track_state::uncompressed_bytes(width, height, tracking.reach());
+        if state > track_state::MAX_BYTES { usize::MAX } else { tracking.window.max(1) as usize }
     }
 
     /// Key of the imported tracks of one view to the frame of an index.

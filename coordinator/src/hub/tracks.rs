@@ -1,8 +1,11 @@
-//! Tracks of views: given out, reported field by field, complete.
+//! Tracks of views: given out window by window, reported field by field, complete.
 
-use std::time::Instant;
+use std::{ops::Range, time::Instant};
 
-use splat::formats::track_blob;
+use splat::{
+    formats::{track_blob, track_state},
+    tracking::TrackState,
+};
 use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{
     Blob, CancelLease, Failure, FailureKind, FieldReport, TrackJob, Tracked, TrackedField,
@@ -11,10 +14,11 @@ use trackersplat_proto::v1::{
 
 use super::{Desk, Hub};
 use crate::{
+    blobs::{BlobError, name},
     failure::{StageError, failure},
-    ledger::{Place, TrackLedger},
+    ledger::{Place, State, StatePlace, TrackLedger},
     queue::{
-        JobId, Lease, SessionId, Task, TaskKey,
+        JobId, Lease, SessionId, Task, TaskHistory, TaskKey,
         task::{TaskState, TaskTrigger},
     },
     store::{Artifact, AttemptOutcome, StoreError, TaskEvent, TaskRecord},
@@ -97,11 +101,9 @@ impl Hub {
         }
         change.commit().await?;
         self.tell_stored(job);
-        let history = match self.store.task(&key).await? {
-            Some(record) => record.history()?,
-            None => return Ok(()),
-        };
-        desk.queue.add(key, history);
+        let Some(record) = self.store.task(&key).await? else { return Ok(()) };
+        let before = desk.ledger(job).map_or(0, |ledger| ledger.before(position));
+        desk.queue.add(key, TaskHistory { before, ..record.history()? });
         Ok(())
     }
 
@@ -147,8 +149,25 @@ impl Hub {
         let id = uuid::Uuid::now_v7().simple().to_string();
         let Some(lease) = desk.queue.lease_own(job, Instant::now(), id) else { return Ok(None) };
         self.record_grant(&lease).await?;
-        let position = lease.key.task.number();
-        Ok(desk.track_job(job, position).map(|request| (lease, request)))
+        let request = self.track_job(&mut desk, job, lease.key.task.number()).await?;
+        Ok(request.map(|request| (lease, request)))
+    }
+
+    /// What whoever leases a view gets.
+    pub(super) async fn track_job(
+        &self,
+        desk: &mut Desk,
+        job: &JobId,
+        position: u32,
+    ) -> Result<Option<TrackJob>, StoreError> {
+        let Some(ledger) = desk.ledger_mut(job) else { return Ok(None) };
+        while let Some(State { key, blob: Some(blob) }) = ledger.next_state(position)
+            && !self.blobs.holds(&blob).await
+        {
+            tracing::warn!(job_id = %job, position, "the tracker's state is gone from the store");
+            ledger.lose_state(position, &key);
+        }
+        Ok(ledger.lease(position))
     }
 
     /// The coordinator has made a field under its own lease.
@@ -156,15 +175,15 @@ impl Hub {
         self.keep_field(lease, &field).await?.map_err(StageError::Failed)
     }
 
-    /// The coordinator's own lease has ended.
+    /// The coordinator's own lease has ended, well with the state after it if that is wanted.
     pub(crate) async fn own_ended(
         &self,
         lease: &Lease,
-        ended: Result<(), Failure>,
+        ended: Result<Option<Blob>, Failure>,
     ) -> Result<(), StageError> {
         let stale = match ended {
-            Ok(()) => self.tracked(lease, Tracked::default()).await?,
-            Err(reason) => self.failed(&lease.id, lease.attempt, reason).await?,
+            Ok(state) => self.tracked(lease, Tracked { fields: Vec::new(), state }).await?,
+            Err(reason) => self.window_failed(lease, reason).await?,
         };
         if let Some(reason) = stale {
             tracing::info!(lease_id = lease.id, reason, "own tracks do not count");
@@ -200,7 +219,7 @@ impl Hub {
         self.dispatch(&mut desk).await
     }
 
-    /// `None` if the tracks of the lease's view are complete, else why they do not count.
+    /// `None` if the window of the lease is complete, else why its tracks do not count.
     pub(super) async fn tracked(
         &self,
         lease: &Lease,
@@ -211,29 +230,167 @@ impl Hub {
                 return self.refused(&lease.id, lease.attempt, reason).await;
             }
         }
-        let position = lease.key.task.number();
-        let mut desk = self.desk.lock().await;
-        if let Some(frame) = desk.ledger(&lease.key.job).and_then(|ledger| ledger.missing(position)) {
-            drop(desk);
-            let reason =
-                failure(FailureKind::Bug, format!("the worker's report lacks the tracks to frame {frame}"));
+        if let Some(state) = &tracked.state
+            && let Err(reason) = self.keep_state(lease, state).await?
+        {
             return self.refused(&lease.id, lease.attempt, reason).await;
         }
-        match desk.queue.commit(&lease.id, lease.attempt) {
-            Ok(lease) => self.record_tracked(&mut desk, &lease).await.map(|()| None),
+        let position = lease.key.task.number();
+        let mut desk = self.desk.lock().await;
+        let ledger = desk.ledger(&lease.key.job);
+        if let Some(lack) = ledger.and_then(|ledger| ledger.lacks(position)) {
+            drop(desk);
+            let reason = failure(FailureKind::Bug, format!("the worker's report lacks {lack}"));
+            return self.refused(&lease.id, lease.attempt, reason).await;
+        }
+        let next = ledger.and_then(|ledger| ledger.missing(position).map(|_| ledger.before(position)));
+        let ended = match next {
+            Some(before) => desk.queue.go_on(&lease.id, lease.attempt, before),
+            None => desk.queue.commit(&lease.id, lease.attempt),
+        };
+        match ended {
+            Ok(lease) if next.is_some() => self.record_window(&mut desk, &lease).await?,
+            Ok(lease) => self.record_tracked(&mut desk, &lease).await?,
             Err(stale) => {
                 drop(desk);
-                self.stale_success(&lease.id, lease.attempt, &stale).await
+                return self.stale_success(&lease.id, lease.attempt, &stale).await;
             }
+        }
+        let ledger = desk.ledger_mut(&lease.key.job);
+        let superseded = ledger.map(|ledger| ledger.take_superseded(position));
+        self.discard_states(&superseded.unwrap_or_default()).await?;
+        Ok(None)
+    }
+
+    /// A window is complete, and the view is ready for the next one.
+    async fn record_window(&self, desk: &mut Desk, lease: &Lease) -> Result<(), StoreError> {
+        let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
+        let mut change = self.store.change().await?;
+        change.end_attempt(&lease.id, AttemptOutcome::Done).await?;
+        change.continue_tracks(&lease.key, lease.attempt, &lease.worker_id, seconds).await?;
+        change.commit().await?;
+        let job = &lease.key.job;
+        let view = desk.view_name(job, lease.key.task.number());
+        let (attempt, worker_id) = (lease.attempt, &lease.worker_id);
+        tracing::info!(job_id = %job, view, attempt, worker_id, seconds, "window tracked");
+        self.tell_stored(job);
+        desk.changed(job);
+        Ok(())
+    }
+
+    /// Somebody gave a window up. Where the state is gone or damaged that it began from, that is nobody's failure: what
+    /// comes before is tracked again. `None`, or why the lease ended meanwhile.
+    pub(super) async fn window_failed(
+        &self,
+        lease: &Lease,
+        reason: Failure,
+    ) -> Result<Option<String>, StoreError> {
+        let (job, position) = (&lease.key.job, lease.key.task.number());
+        let begun_from = {
+            let desk = self.desk.lock().await;
+            desk.ledger(job).and_then(|ledger| ledger.leased_state(position))
+        };
+        let Some(State { key, blob: Some(blob) }) = begun_from else {
+            return self.failed(&lease.id, lease.attempt, reason).await;
+        };
+        let is_lost =
+            matches!(self.blobs.get(&blob).await, Err(BlobError::Missing(_) | BlobError::Corrupt { .. }));
+        if !is_lost {
+            return self.failed(&lease.id, lease.attempt, reason).await;
+        }
+        let mut desk = self.desk.lock().await;
+        let Some(ledger) = desk.ledger_mut(job) else { return Ok(Some("the job has ended".into())) };
+        ledger.lose_state(position, &key);
+        let before = ledger.before(position);
+        if let Err(stale) = desk.queue.go_on(&lease.id, lease.attempt, before) {
+            return Ok(Some(stale.to_string()));
+        }
+        let why = "the tracker's state is gone from the store, or damaged; tracks before it are made again";
+        tracing::warn!(job_id = %job, position, attempt = lease.attempt, reason = reason.message, "{why}");
+        let mut change = self.store.change().await?;
+        change.end_attempt(&lease.id, AttemptOutcome::Released(why)).await?;
+        change.release_task(&lease.key, lease.attempt, &lease.worker_id).await?;
+        change.commit().await?;
+        self.discard_states(&[State { key, blob: Some(blob) }]).await?;
+        self.tell_stored(job);
+        desk.changed(job);
+        Ok(None)
+    }
+
+    /// Removes states that nobody goes on from any more. If another job of the same clip does, it begins earlier.
+    async fn discard_states(&self, states: &[State]) -> Result<(), StoreError> {
+        if states.is_empty() {
+            return Ok(());
+        }
+        let mut change = self.store.change().await?;
+        for state in states {
+            change.remove_artifact(&state.key).await?;
+        }
+        change.commit().await?;
+        // What remembers nothing is the same blob for every view, and one may be about to be reported.
+        let nothing = name(&track_state::encode(&TrackState::default()));
+        for blob in states.iter().filter_map(|state| state.blob.as_ref()).filter(|blob| **blob != nothing) {
+            if !self.store.is_artifact(blob).await? {
+                self.blobs.remove(blob).await;
+            }
+        }
+        Ok(())
+    }
+
+    /// Verifies the state after a window and keeps it, if it is wanted and the lease is held. `Err`: the attempt has failed,
+    /// and why.
+    async fn keep_state(&self, lease: &Lease, blob: &Blob) -> Result<Result<(), Failure>, StoreError> {
+        let (job, position) = (&lease.key.job, lease.key.task.number());
+        let place = {
+            let desk = self.desk.lock().await;
+            desk.ledger(job).and_then(|ledger| ledger.state_place(position))
+        };
+        let Some(StatePlace { key, past }) = place else { return Ok(Ok(())) };
+        if let Err(reason) = self.verify_state(blob, past).await {
+            return Ok(Err(reason));
+        }
+        let mut desk = self.desk.lock().await;
+        if desk.queue.check(&lease.id, lease.attempt).is_err() {
+            return Ok(Ok(()));
+        }
+        let artifact = Artifact { blob: blob.clone(), note: String::new() };
+        let mut change = self.store.change().await?;
+        change.put_artifact(&key, "track-state", &artifact).await?;
+        change.forget_failures(&lease.key).await?;
+        change.commit().await?;
+        desk.queue.progressed(&lease.key);
+        if let Some(ledger) = desk.ledger_mut(job) {
+            ledger.keep_state(position, blob);
+        }
+        Ok(Ok(()))
+    }
+
+    /// The state is what its name says, readable, and of frames that the next window is given.
+    async fn verify_state(&self, blob: &Blob, past: Range<usize>) -> Result<(), Failure> {
+        let bug = |message: String| failure(FailureKind::Bug, message);
+        let bytes = self.fetched(blob, "the tracker's state").await?;
+        let decoded = tokio::task::spawn_blocking(move || track_state::decode(&bytes)).await;
+        let state = decoded
+            .map_err(|error| bug(format!("reading the tracker's state: {error}")))?
+            .map_err(|error| bug(format!("the tracker's state: {error}")))?;
+        match state.indices().find(|index| !past.contains(index)) {
+            Some(index) => Err(bug(format!(
+                "the tracker's state remembers the view's frame {index}, frames {} to {} are possible",
+                past.start,
+                past.end - 1
+            ))),
+            None => Ok(()),
         }
     }
 
     async fn record_tracked(&self, desk: &mut Desk, lease: &Lease) -> Result<(), StoreError> {
         let (job, position) = (&lease.key.job, lease.key.task.number());
         let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
+        let before = self.store.task(&lease.key).await?.map_or(0.0, |record| record.seconds);
         let mut change = self.store.change().await?;
         change.end_attempt(&lease.id, AttemptOutcome::Done).await?;
         change.commit_tracks(job, position, seconds).await?;
+        let seconds = before + seconds;
         let event = TaskEvent {
             attempt: lease.attempt,
             worker: &lease.worker_id,
@@ -337,11 +494,6 @@ impl Desk {
         let ledger =
             ledger.ok_or_else(|| failure(FailureKind::Transient, "the job is not ready for results"))?;
         ledger.place(position, field).map_err(|message| failure(FailureKind::Bug, message))
-    }
-
-    /// What a worker gets that is to track a view.
-    pub(super) fn track_job(&self, job: &JobId, position: u32) -> Option<TrackJob> {
-        self.ledger(job)?.task(position)
     }
 
     /// Name of a tracked view; empty if nothing is known of it.

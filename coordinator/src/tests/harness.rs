@@ -383,10 +383,15 @@ pub(super) fn model(x: f32) -> Gaussians {
     }
 }
 
-/// A clip in the nerfstudio layout with one file per frame.
+/// A clip of three frames in the nerfstudio layout with one file per frame.
 pub(super) fn write_clip(root: &Path, shade: u8) {
+    write_clip_of(3, root, shade);
+}
+
+/// [`write_clip`] of any number of frames.
+pub(super) fn write_clip_of(frames: u32, root: &Path, shade: u8) {
     std::fs::create_dir_all(root.join("transforms")).unwrap();
-    for frame in 1..=3_u32 {
+    for frame in 1..=frames {
         let mut views = Vec::new();
         for (index, name) in ["cam00", "cam01", "cam02", "test00"].into_iter().enumerate() {
             let folder = root.join("images").join(name);

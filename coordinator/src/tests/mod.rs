@@ -14,3 +14,4 @@ mod runs;
 mod track_files;
 mod tracks;
 mod transfers;
+mod windows;
