@@ -16,7 +16,7 @@ const HEADER: usize = 4 + 4 + 4;
 /// Largest body, uncompressed. Bounds what a blob can make the decoder allocate.
 pub const MAX_BYTES: u64 = 1 << 30;
 
-/// Bytes of a state of tracks of this size before compression, which saves about a quarter.
+/// Bytes of a state of tracks of this size before compression, which saves about two fifths.
 pub fn uncompressed_bytes(width: u32, height: u32, frames: u32) -> u64 {
     let pixels = u64::from(width).saturating_mul(u64::from(height));
     let per_frame = pixels.saturating_mul(4 * PLANES as u64).saturating_add(pixels.div_ceil(8) + 4);
