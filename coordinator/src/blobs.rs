@@ -87,6 +87,16 @@ impl BlobStore {
         }
     }
 
+    /// Removes a blob that nothing names any more. What cannot be removed is left behind.
+    pub async fn remove(&self, blob: &Blob) {
+        let Ok(path) = path_of(&blob.digest) else { return };
+        if let Err(error) = self.store.delete(&path).await
+            && !matches!(error, object_store::Error::NotFound { .. })
+        {
+            tracing::warn!(digest = blob.digest, %error, "a blob that nobody needs is left behind");
+        }
+    }
+
     /// Whether a blob is there and of its size. Its content is verified when it is read.
     pub async fn holds(&self, blob: &Blob) -> bool {
         let Ok(path) = path_of(&blob.digest) else { return false };

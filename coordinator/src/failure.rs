@@ -1,6 +1,10 @@
 //! Why a stage or a verification failed, in the kinds of the wire.
 
-use splat::{engine::EngineError, static_model::StaticModelError, tracking::learned::LearnedError};
+use splat::{
+    engine::EngineError,
+    static_model::StaticModelError,
+    tracking::{StateMisfit, learned::LearnedError},
+};
 use trackersplat_proto::v1::{Failure, FailureKind};
 
 use crate::{blobs::BlobError, store::StoreError};
@@ -58,6 +62,12 @@ impl From<EngineError> for StageError {
 impl From<LearnedError> for StageError {
     fn from(error: LearnedError) -> Self {
         Self::bad_input(error.to_string())
+    }
+}
+
+impl From<StateMisfit> for StageError {
+    fn from(misfit: StateMisfit) -> Self {
+        Self::new(FailureKind::Bug, misfit.to_string())
     }
 }
 

@@ -1,6 +1,15 @@
 //! Which track fields of a job there are, and which are still to be made: pure data, kept by the hub.
+//!
+//! Views are tracked in windows of some frames. Tracking goes on at the end of any window whose state is there; where
+//! none is, at the key frame.
 
-use std::collections::{BTreeMap, BTreeSet};
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    ops::Range,
+};
 
 use trackersplat_proto::v1::{Blob, Failure, TrackFrame, TrackJob, TrackedField, Tracker};
 
@@ -12,7 +21,11 @@ pub(crate) struct TrackLedger {
     job: JobId,
     tracker: Tracker,
     key_frame: u32,
+    /// Frames that a state may reach back.
+    reach: usize,
     views: BTreeMap<u32, TrackedView>,
+    /// What the last lease of each view covers.
+    leased: BTreeMap<u32, Window>,
     /// Fields that are there, and all.
     counts: (u64, u64),
     failed: Option<Failure>,
@@ -29,6 +42,29 @@ pub(crate) struct TrackedView {
     pub(crate) key_image: Blob,
     /// In order of frames, those after the key frame.
     pub(crate) fields: Vec<Field>,
+    /// Fields per window.
+    pub(crate) window: usize,
+    /// The tracker's states after every window but the last.
+    pub(crate) states: Vec<State>,
+}
+
+/// What the tracker remembers after a window.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct State {
+    /// Names the state among the artifacts.
+    pub(crate) key: String,
+    /// The state, while there is one.
+    pub(crate) blob: Option<Blob>,
+}
+
+/// What one lease covers: consecutive fields of a view.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Window {
+    number: usize,
+    /// By index.
+    fields: Range<usize>,
+    /// Whether there is more to track after it, and nothing to go on from.
+    wants_state: bool,
 }
 
 /// The tracks of one view to one frame.
@@ -40,6 +76,37 @@ pub(crate) struct Field {
     pub(crate) key: String,
     /// The field, once there is one.
     pub(crate) tracks: Option<Blob>,
+}
+
+/// Where the state belongs that a window is to leave.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct StatePlace {
+    pub(crate) key: String,
+    /// Places in the view of the frames that it may remember.
+    pub(crate) past: Range<usize>,
+}
+
+impl TrackedView {
+    /// What is to be tracked next, if anything is.
+    fn next(&self) -> Option<Window> {
+        let is_missing = |field: &Field| field.tracks.is_none();
+        let first_missing = self.fields.iter().position(is_missing)?;
+        let last_missing = self.fields.iter().rposition(is_missing)?;
+        let is_there = |number: &usize| *number == 0 || self.state(number - 1).is_some();
+        let window = self.window.max(1);
+        let number = (0..=first_missing / window).rev().find(is_there)?;
+        let start = number * window;
+        let end = (start + window).min(self.fields.len());
+        let wants_state = last_missing >= end && self.state(number).is_none();
+        // Fields that exist after the last missing one are for nobody.
+        let end = if wants_state { end } else { end.min(last_missing + 1) };
+        Some(Window { number, fields: start..end, wants_state })
+    }
+
+    /// The state after a window.
+    fn state(&self, number: usize) -> Option<&Blob> {
+        self.states.get(number)?.blob.as_ref()
+    }
 }
 
 /// Where a field belongs that is not there yet.
@@ -55,12 +122,23 @@ impl TrackLedger {
         job: JobId,
         key_frame: u32,
         tracker: Tracker,
+        reach: usize,
         views: BTreeMap<u32, TrackedView>,
     ) -> Self {
         let fields = || views.values().flat_map(|view| &view.fields);
         let held = fields().filter(|field| field.tracks.is_some()).count();
         let counts = (held as u64, fields().count() as u64);
-        Self { job, tracker, key_frame, views, counts, failed: None, adopted: BTreeSet::new() }
+        Self {
+            job,
+            tracker,
+            key_frame,
+            reach,
+            views,
+            leased: BTreeMap::new(),
+            counts,
+            failed: None,
+            adopted: BTreeSet::new(),
+        }
     }
 
     /// Positions of the views, complete or not.
@@ -79,21 +157,105 @@ impl TrackLedger {
         self.views.get(&position).map_or("", |view| view.name.as_str())
     }
 
-    /// What a worker gets; `None` if the view is not tracked.
-    pub(crate) fn task(&self, position: u32) -> Option<TrackJob> {
+    /// What a worker gets that is to go on with a view; `None` if nothing of it is to be tracked.
+    pub(crate) fn lease(&mut self, position: u32) -> Option<TrackJob> {
+        let window = self.views.get(&position)?.next()?;
+        let job = self.job_of(position, &window);
+        self.leased.insert(position, window);
+        job
+    }
+
+    fn job_of(&self, position: u32, window: &Window) -> Option<TrackJob> {
         let view = self.views.get(&position)?;
-        let key = TrackFrame { frame: self.key_frame, image: Some(view.key_image.clone()), tracks: None };
-        let later = view.fields.iter().map(|field| TrackFrame {
+        let start = window.fields.start;
+        let frame = |field: &Field| TrackFrame {
             frame: field.frame,
             image: Some(field.image.clone()),
             tracks: field.tracks.clone(),
-        });
+        };
+        let key = TrackFrame { frame: self.key_frame, image: Some(view.key_image.clone()), tracks: None };
         Some(TrackJob {
             job_id: self.job.to_string(),
             view: view.name.clone(),
             tracker: Some(self.tracker.clone()),
-            frames: std::iter::once(key).chain(later).collect(),
+            frames: std::iter::once(key)
+                .chain(view.fields[window.fields.clone()].iter().map(frame))
+                .collect(),
+            // Places count the key frame.
+            first: u32::try_from(start + 1).unwrap_or(u32::MAX),
+            state: self.begins_from(position, window).and_then(|state| state.blob.clone()),
+            past: view.fields[start.saturating_sub(self.reach)..start].iter().map(frame).collect(),
+            wants_state: window.wants_state,
         })
+    }
+
+    /// The state that a window begins from; `None` at the key frame.
+    fn begins_from(&self, position: u32, window: &Window) -> Option<&State> {
+        self.views.get(&position)?.states.get(window.number.checked_sub(1)?)
+    }
+
+    /// The frame before which a view's next window goes out: tracks are made a window ahead of the frames that need them,
+    /// those of all views in step.
+    pub(crate) fn before(&self, position: u32) -> u32 {
+        let Some(view) = self.views.get(&position) else { return 0 };
+        let next = view.next().and_then(|window| window.number.checked_sub(1));
+        next.map_or(0, |earlier| view.fields[earlier * view.window].frame)
+    }
+
+    /// The state that a view would go on from.
+    pub(crate) fn next_state(&self, position: u32) -> Option<State> {
+        let window = self.views.get(&position)?.next()?;
+        self.begins_from(position, &window).cloned()
+    }
+
+    /// The state that the leased window of a view began from.
+    pub(crate) fn leased_state(&self, position: u32) -> Option<State> {
+        self.begins_from(position, self.leased.get(&position)?).cloned()
+    }
+
+    /// What the leased window of a view still lacks.
+    pub(crate) fn lacks(&self, position: u32) -> Option<String> {
+        let (view, window) = (self.views.get(&position)?, self.leased.get(&position)?);
+        let missing = view.fields[window.fields.clone()].iter().find(|field| field.tracks.is_none());
+        if let Some(field) = missing {
+            return Some(format!("the tracks to frame {}", field.frame));
+        }
+        let lacks_state = window.wants_state && view.state(window.number).is_none();
+        lacks_state.then(|| "the tracker's state after its window".to_owned())
+    }
+
+    /// Where the state belongs that the leased window of a view is to leave; `None` if none is wanted.
+    pub(crate) fn state_place(&self, position: u32) -> Option<StatePlace> {
+        let (view, window) = (self.views.get(&position)?, self.leased.get(&position)?);
+        if !window.wants_state || view.state(window.number).is_some() {
+            return None;
+        }
+        let next = window.fields.end + 1;
+        let past = next.saturating_sub(self.reach).max(1)..next;
+        Some(StatePlace { key: view.states.get(window.number)?.key.clone(), past })
+    }
+
+    /// The state after the leased window of a view is there.
+    pub(crate) fn keep_state(&mut self, position: u32, blob: &Blob) {
+        let Some(window) = self.leased.get(&position) else { return };
+        let states = self.views.get_mut(&position).map(|view| &mut view.states);
+        if let Some(state) = states.and_then(|states| states.get_mut(window.number)) {
+            state.blob = Some(blob.clone());
+        }
+    }
+
+    /// A state is gone: what is tracked next begins before it.
+    pub(crate) fn lose_state(&mut self, position: u32, key: &str) {
+        let states = self.views.get_mut(&position).map(|view| view.states.iter_mut());
+        states.into_iter().flatten().filter(|state| state.key == key).for_each(|state| state.blob = None);
+    }
+
+    /// Takes the states of a view that nobody needs any more: those before the one to go on from.
+    pub(crate) fn take_superseded(&mut self, position: u32) -> Vec<State> {
+        let Some(view) = self.views.get_mut(&position) else { return Vec::new() };
+        let needed = view.next().map_or(usize::MAX, |window| window.number.saturating_sub(1));
+        let superseded = view.states.iter_mut().take(needed).filter(|state| state.blob.is_some());
+        superseded.map(|state| State { key: state.key.clone(), blob: state.blob.take() }).collect()
     }
 
     /// Where a field belongs; `None` if this very field is there already. Refuses a frame that the job does not have, and
@@ -165,98 +327,14 @@ impl TrackLedger {
         self.failed.as_ref()
     }
 
+    /// The tracks of one view to a frame.
+    #[cfg(test)]
+    pub(crate) fn tracks(&self, position: u32, frame: u32) -> Option<Blob> {
+        self.field(position, frame)?.tracks.clone()
+    }
+
     fn field(&self, position: u32, frame: u32) -> Option<&Field> {
         let fields = &self.views.get(&position)?.fields;
         fields.binary_search_by_key(&frame, |field| field.frame).ok().map(|index| &fields[index])
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used, reason = "tests")]
-
-    use trackersplat_proto::v1::FailureKind;
-
-    use super::*;
-
-    fn blob(name: &str) -> Blob {
-        Blob { digest: name.into(), size: 10 }
-    }
-
-    fn found(frame: u32, name: &str) -> TrackedField {
-        TrackedField { frame, tracks: Some(blob(name)) }
-    }
-
-    /// Views 0 and 2 over frames 3, 4, 6; the key frame is 3.
-    fn ledger() -> TrackLedger {
-        let field = |frame: u32| Field {
-            frame,
-            image: blob(&format!("image-{frame}")),
-            key: format!("key-{frame}"),
-            tracks: None,
-        };
-        let view = |name: &str| TrackedView {
-            name: name.into(),
-            size: (8, 6),
-            key_image: blob("image-3"),
-            fields: vec![field(4), field(6)],
-        };
-        let tracker = Tracker { settings_json: "{}".into(), ..Tracker::default() };
-        let views = [(0, view("cam00")), (2, view("cam02"))].into();
-        TrackLedger::new("job".into(), 3, tracker, views)
-    }
-
-    #[test]
-    fn a_frame_is_tracked_once_every_view_is() {
-        let mut ledger = ledger();
-        assert_eq!(ledger.at(3), Some(BTreeMap::new()), "nothing moves to the key frame");
-        ledger.keep(0, &found(4, "a"));
-        assert_eq!((ledger.at(4), ledger.missing(0), ledger.missing(2)), (None, Some(6), Some(4)));
-        ledger.keep(2, &found(4, "b"));
-        assert_eq!(ledger.at(4), Some([(0, blob("a")), (2, blob("b"))].into()));
-        assert_eq!((ledger.at(6), ledger.at(5), ledger.counts()), (None, None, (2, 4)));
-        ledger.keep(0, &found(6, "c"));
-        assert_eq!((ledger.missing(0), ledger.positions()), (None, vec![0, 2]));
-    }
-
-    #[test]
-    fn the_first_field_counts_and_another_one_is_a_defect() {
-        let mut ledger = ledger();
-        let place = Place { key: "key-4".into(), size: (8, 6) };
-        assert_eq!(ledger.place(0, &found(4, "a")), Ok(Some(place)));
-        ledger.keep(0, &found(4, "a"));
-        assert_eq!(ledger.place(0, &found(4, "a")), Ok(None));
-        let message = ledger.place(0, &found(4, "other")).unwrap_err();
-        assert!(message.contains("cam00") && message.contains("frame 4"), "{message}");
-        ledger.keep(0, &found(4, "other"));
-        assert_eq!(ledger.task(0).unwrap().frames[1].tracks, Some(blob("a")));
-        for (position, frame) in [(0, 3), (0, 5), (1, 4)] {
-            assert!(ledger.place(position, &found(frame, "a")).is_err(), "{position} {frame}");
-        }
-        assert!(ledger.place(0, &TrackedField { frame: 6, tracks: None }).is_err());
-    }
-
-    #[test]
-    fn a_field_of_another_job_counts_and_a_different_one_is_left_aside() {
-        let mut ledger = ledger();
-        ledger.adopt(0, 4, blob("theirs"));
-        assert_eq!(
-            (ledger.task(0).unwrap().frames[1].tracks.clone(), ledger.counts()),
-            (Some(blob("theirs")), (1, 4))
-        );
-        assert_eq!(ledger.place(0, &found(4, "own")), Ok(None));
-    }
-
-    #[test]
-    fn a_task_names_what_exists_and_a_failure_its_view() {
-        let mut ledger = ledger();
-        ledger.keep(2, &found(6, "c"));
-        let task = ledger.task(2).unwrap();
-        let frames: Vec<_> = task.frames.iter().map(|frame| (frame.frame, frame.tracks.is_some())).collect();
-        assert_eq!(frames, [(3, false), (4, false), (6, true)]);
-        assert_eq!((task.view.as_str(), ledger.task(1)), ("cam02", None));
-        ledger.fail(2, &failure(FailureKind::BadInput, "frame 4 is no image"));
-        ledger.fail(0, &failure(FailureKind::Bug, "later"));
-        assert_eq!(ledger.failed().unwrap().message, "tracks of view 'cam02': frame 4 is no image");
     }
 }

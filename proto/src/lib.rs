@@ -4,6 +4,7 @@
 
 pub mod failure;
 pub mod ids;
+mod windows;
 
 /// Messages and services of `trackersplat.v1`; the comments of the `.proto` files are the reference.
 #[allow(

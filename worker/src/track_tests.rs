@@ -55,6 +55,8 @@ fn track_job(coordinator: &TestCoordinator, frames: u32) -> TrackJob {
         view: "cam00".into(),
         tracker: Some(Tracker { settings_json, ..Tracker::default() }),
         frames: (1..=frames).map(frame).collect(),
+        first: 1,
+        ..TrackJob::default()
     }
 }
 
@@ -254,4 +256,64 @@ async fn tracking_goes_on_over_a_broken_stream_and_the_report_names_what_was_not
     assert_eq!(session.register.held_lease_id, "lease-1");
     let fields = fields_of(session.wait_for_report().await);
     assert_eq!(fields.iter().map(|field| field.0).collect::<Vec<_>>(), (2..=12).collect::<Vec<_>>());
+}
+
+/// The window of a job that begins at a place and has some frames.
+fn cut(job: &TrackJob, first: usize, frames: usize, state: Option<Blob>) -> TrackJob {
+    let mut window = job.clone();
+    window.frames = [&job.frames[..1], &job.frames[first..first + frames]].concat();
+    window.first = first as u32;
+    window.past = job.frames[first.saturating_sub(2).max(1)..first].to_vec();
+    window.state = state;
+    window.wants_state = first + frames < job.frames.len();
+    window
+}
+
+async fn outcome_of(session: &mut Session, lease_id: &str, job: TrackJob) -> report::Outcome {
+    lease(session, lease_id, job).await;
+    let report = session.wait_for_report().await;
+    session.acknowledge(&report).await;
+    session.wait_for_lease_request().await;
+    report.outcome.unwrap()
+}
+
+#[tokio::test]
+async fn windows_give_the_fields_of_the_whole_and_go_on_from_a_stored_state() {
+    let coordinator = TestCoordinator::start().await;
+    let job = track_job(&coordinator, 6);
+    let whole = tracked_with(&coordinator, 1, job.clone()).await;
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    let (mut fields, mut state) = (Vec::new(), None);
+    for first in [1, 3, 5] {
+        let window = cut(&job, first, if first == 5 { 1 } else { 2 }, state.take());
+        let outcome = outcome_of(&mut session, &format!("from {first}"), window).await;
+        let report::Outcome::Tracked(tracked) = outcome else { panic!("{outcome:?}") };
+        fields.extend(tracked.fields.into_iter().map(|field| (field.frame, field.tracks.unwrap())));
+        state = tracked.state;
+        assert_eq!(state.is_some(), first < 5);
+    }
+    assert_eq!(fields, whole);
+}
+
+#[tokio::test]
+async fn a_state_that_does_not_fit_is_a_defect_and_says_so() {
+    let coordinator = TestCoordinator::start().await;
+    let job = track_job(&coordinator, 6);
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    let outcome = outcome_of(&mut session, "first", cut(&job, 1, 3, None)).await;
+    let report::Outcome::Tracked(Tracked { state, .. }) = outcome else { panic!("{outcome:?}") };
+    let no_state = Some(coordinator.store(b"no state"));
+    let no_images = TrackJob { past: Vec::new(), ..cut(&job, 4, 1, state.clone()) };
+    for (window, said) in [
+        (cut(&job, 4, 1, no_state), "not a TSSTATE blob"),
+        (cut(&job, 3, 1, state), "it knows frame 3, from 3 on"),
+        (no_images, "lacks the frame at place 2"),
+    ] {
+        let outcome = outcome_of(&mut session, said, window).await;
+        let report::Outcome::Failure(failure) = outcome else { panic!("{outcome:?}") };
+        assert_eq!(failure.kind(), FailureKind::Bug);
+        assert!(failure.message.contains(said), "{}", failure.message);
+    }
 }

@@ -1,15 +1,15 @@
-//! The tracks of a view from the wire to a report: every field is stored and said as soon as it is there.
+//! A window of the tracks of a view from the wire to a report: every field is stored and said as soon as it is there.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
 use backon::Retryable;
 use bytes::Bytes;
 use splat::{
-    formats::track_blob,
+    formats::{track_blob, track_state},
     frame::FrameProgress,
     image::Image,
     tracking::{
-        TrackField, Tracker, TrackingSettings,
+        StateMisfit, TrackField, TrackState, Tracker, TrackingSettings,
         learned::{LearnedError, MAX_MODEL_BYTES},
     },
 };
@@ -67,8 +67,14 @@ impl From<LearnedError> for Stop {
     }
 }
 
+impl From<StateMisfit> for Stop {
+    fn from(misfit: StateMisfit) -> Self {
+        JobError::new(FailureKind::Bug, misfit.to_string()).into()
+    }
+}
+
 impl JobRunner {
-    /// Tracks one view to its report; `None` if it was cancelled.
+    /// Tracks a window of one view to its report; `None` if it was cancelled.
     pub(crate) async fn track(
         &self,
         job: TrackJob,
@@ -109,7 +115,7 @@ fn failed(error: JobError) -> Option<Outcome> {
     Some(Outcome::Failure(Failure { kind: error.kind.into(), message: error.message }))
 }
 
-/// One view that is tracked. Runs on threads of the worker's pool, where waiting is allowed.
+/// A window of one view that is tracked. Runs on threads of the worker's pool, where waiting is allowed.
 struct Tracking {
     settings: TrackingSettings,
     last: Arc<LastTracker>,
@@ -123,27 +129,55 @@ struct Tracking {
 
 impl Tracking {
     fn run(&self) -> Result<Tracked, Stop> {
-        let frames = &self.job.frames;
-        // What chains tracks through earlier frames makes the fields before this one again, later ones not.
-        let last = frames.iter().rposition(|frame| frame.tracks.is_none()).unwrap_or_default();
+        let window = self.job.window();
         let mut tracked = Tracked::default();
-        let mut load = |index: usize| self.load(&frames[index]);
-        let mut emit = |index: usize, field: TrackField| {
-            if frames[index].tracks.is_none() {
-                let stored = TrackedField {
-                    frame: frames[index].frame,
-                    tracks: Some(self.transfer(|| self.store(&field))?),
-                };
+        let mut load = |place: usize| self.load(self.frame(place)?);
+        let mut emit = |place: usize, field: TrackField| {
+            let frame = self.frame(place)?;
+            // What chains tracks makes fields that exist again; nobody needs them.
+            if frame.tracks.is_none() {
+                let encoded = Bytes::from(track_blob::encode(&field));
+                let stored = TrackedField { frame: frame.frame, tracks: Some(self.store(encoded)?) };
                 tracked.fields.push(stored.clone());
                 // Nobody listens any more: the lease is gone, and the report with it.
                 let _ = self.said.fields.send(stored);
             }
-            self.advance(index, last)
+            self.advance(place + 1 - window.start)
         };
-        self.advance(0, last)?;
-        let is_missing = |index: usize| frames[index].tracks.is_none();
-        self.tracker()?.track_missing(last + 1, &is_missing, &mut load, &self.settings, &mut emit)?;
+        self.advance(0)?;
+        let is_missing = |place: usize| self.frame(place).is_ok_and(|frame| frame.tracks.is_none());
+        let (tracker, from) = (self.tracker()?, self.state()?);
+        let after =
+            tracker.track_window(from, window.clone(), &is_missing, &mut load, &self.settings, &mut emit)?;
+        if self.job.wants_state {
+            tracked.state = Some(self.store(Bytes::from(track_state::encode(&after)))?);
+        }
         Ok(tracked)
+    }
+
+    fn frame(&self, place: usize) -> Result<&TrackFrame, Stop> {
+        let named = self.job.frame_at(place);
+        let lacking = || {
+            let view = &self.job.view;
+            JobError::new(
+                FailureKind::Bug,
+                format!(
+                    "view '{view}': the lease lacks the frame at place {place}: a defect of the coordinator"
+                ),
+            )
+        };
+        Ok(named.ok_or_else(lacking)?)
+    }
+
+    /// What tracking goes on from.
+    fn state(&self) -> Result<TrackState, Stop> {
+        let Some(blob) = &self.job.state else { return Ok(TrackState::default()) };
+        let bytes = self.transfer(|| self.blobs.get(blob))?;
+        let view = &self.job.view;
+        let decoded = track_state::decode(&bytes);
+        Ok(decoded.map_err(|error| {
+            JobError::new(FailureKind::Bug, format!("the tracker's state of view '{view}': {error}"))
+        })?)
     }
 
     fn tracker(&self) -> Result<Arc<Tracker>, Stop> {
@@ -166,8 +200,10 @@ impl Tracking {
         Ok(tracker)
     }
 
-    fn advance(&self, index: usize, last: usize) -> Result<(), Stop> {
-        let progress = FrameProgress { stage: "tracks", done: index as u64, total: last as u64 };
+    /// So many frames of the window are done.
+    fn advance(&self, done: usize) -> Result<(), Stop> {
+        let total = self.job.window().len() as u64;
+        let progress = FrameProgress { stage: "tracks", done: done as u64, total };
         self.said.progress.send_replace(progress);
         if self.cancel.is_cancelled() { Err(Stop::Cancelled) } else { Ok(()) }
     }
@@ -186,8 +222,8 @@ impl Tracking {
         Ok(Arc::new(image))
     }
 
-    async fn store(&self, field: &TrackField) -> Result<trackersplat_proto::v1::Blob, BlobError> {
-        self.blobs.put(Bytes::from(track_blob::encode(field))).await
+    fn store(&self, bytes: Bytes) -> Result<v1::Blob, Stop> {
+        self.transfer(|| self.blobs.put(bytes.clone()))
     }
 
     /// Waits for a transfer, which is tried again while it fails for reasons that may pass.

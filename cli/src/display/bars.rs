@@ -17,8 +17,8 @@ pub(super) struct Bars {
     stage: ProgressBar,
     frames: ProgressBar,
     running: BTreeMap<String, ProgressBar>,
-    /// Whether the stage bar is of frames: handing them out is over before anybody could read it.
-    are_frames_running: bool,
+    /// Of the job: decides whose progress the stage bar shows.
+    state: JobState,
 }
 
 impl Bars {
@@ -35,13 +35,16 @@ impl Bars {
             stage,
             frames,
             running: BTreeMap::new(),
-            are_frames_running: false,
+            state: JobState::Unspecified,
         }
     }
 
     fn progress(&mut self, progress: &Progress) {
         let task = match (progress.frame, progress.view.as_str()) {
-            (0, "") if self.are_frames_running => return,
+            // Handing frames out is over before anybody could read it.
+            (0, "") if self.state == JobState::Frames => return,
+            // Workers track while the static model is made, whose bar it is.
+            (0, "") if self.state == JobState::StaticModel && progress.stage == "tracking" => return,
             (0, "") => return advance(&self.stage, "{spinner}", progress.done, progress.total),
             (0, view) => view_label(view),
             (frame, _) => frame_label(frame),
@@ -84,8 +87,8 @@ impl Display for Bars {
                 self.stage.set_prefix(job_state_label(change.state()));
                 self.stage.reset_eta();
                 advance(&self.stage, "{spinner}", 0, 0);
-                self.are_frames_running = change.state() == JobState::Frames;
-                if self.are_frames_running {
+                self.state = change.state();
+                if self.state == JobState::Frames {
                     self.frames.set_prefix("done");
                 }
             }

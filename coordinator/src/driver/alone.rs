@@ -8,17 +8,17 @@ use std::sync::{
 use bytes::Bytes;
 use futures::future::try_join_all;
 use splat::{
-    formats::track_blob,
+    formats::{track_blob, track_state},
     image::Image,
     settings::Settings,
-    tracking::{TrackField, Tracker},
+    tracking::{TrackField, TrackState, Tracker},
 };
 use tokio::{
     runtime::Handle,
     sync::{Notify, OnceCell},
 };
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{self, TrackJob, TrackedField};
+use trackersplat_proto::v1::{self, Blob, FailureKind, TrackFrame, TrackJob, TrackedField};
 
 use super::Job;
 use crate::{compute::go_on, failure::StageError, hub::Hub, queue::Lease};
@@ -42,8 +42,8 @@ impl Job {
         }
     }
 
-    /// Tracks as many views at a time as the compute pool has threads. Views that are begun are finished, though workers
-    /// may come meanwhile: those take the others.
+    /// Tracks as many views at a time as the compute pool has threads, window by window. Windows that are begun are finished,
+    /// though workers may come meanwhile: those take the others.
     async fn track_while_alone(&self) -> Result<(), StageError> {
         // One for all views: a network may be large.
         let tracker = OnceCell::new();
@@ -54,7 +54,7 @@ impl Job {
         Ok(())
     }
 
-    /// Tracks one view after the other. A lane without a view waits while another has one: a worker that goes leaves
+    /// Tracks one window after the other. A lane without a view waits while another has one: a worker that goes leaves
     /// views behind.
     async fn track_in_turn(&self, tracker: &OnceCell<Arc<Tracker>>, lanes: &Lanes) -> Result<(), StageError> {
         let mut changed = self.changed.clone();
@@ -97,7 +97,7 @@ impl Job {
             self.hub.compute.run(move || work.run()).await
         };
         let ended = match tracked.await {
-            Ok(()) => Ok(()),
+            Ok(state) => Ok(state),
             Err(StageError::Failed(reason)) => Err(reason),
             Err(error) => return Err(error),
         };
@@ -125,7 +125,7 @@ struct Lanes {
     ended: Notify,
 }
 
-/// The tracks of one view. Runs on threads of the compute pool, where waiting is allowed.
+/// A window of the tracks of one view. Runs on threads of the compute pool, where waiting is allowed.
 struct OwnTracking {
     hub: Arc<Hub>,
     lease: Lease,
@@ -137,16 +137,40 @@ struct OwnTracking {
 }
 
 impl OwnTracking {
-    fn run(&self) -> Result<(), StageError> {
-        let frames = &self.request.frames;
-        let mut load = |index: usize| self.load(index);
-        let mut emit = |index: usize, field: TrackField| self.emit(index, &field);
-        let is_missing = |index: usize| frames[index].tracks.is_none();
-        self.tracker.track_missing(frames.len(), &is_missing, &mut load, &self.settings.tracking, &mut emit)
+    /// The state after the window, if it is wanted.
+    fn run(&self) -> Result<Option<Blob>, StageError> {
+        let (request, settings) = (&self.request, &self.settings.tracking);
+        let is_missing = |place: usize| request.frame_at(place).is_some_and(|frame| frame.tracks.is_none());
+        let mut load = |place: usize| self.load(place);
+        let mut emit = |place: usize, field: TrackField| self.emit(place, &field);
+        let (from, window) = (self.state()?, request.window());
+        let after = self.tracker.track_window(from, window, &is_missing, &mut load, settings, &mut emit)?;
+        if !request.wants_state {
+            return Ok(None);
+        }
+        let encoded = Bytes::from(track_state::encode(&after));
+        Ok(Some(self.runtime.block_on(self.hub.blobs.put(encoded))?))
     }
 
-    fn load(&self, index: usize) -> Result<Arc<Image>, StageError> {
-        let frame = &self.request.frames[index];
+    /// What tracking goes on from.
+    fn state(&self) -> Result<TrackState, StageError> {
+        let Some(blob) = &self.request.state else { return Ok(TrackState::default()) };
+        let bytes = self.runtime.block_on(self.hub.blobs.get(blob))?;
+        track_state::decode(&bytes).map_err(|error| {
+            let message = format!("the tracker's state of view '{}': {error}", self.request.view);
+            StageError::new(FailureKind::Bug, message)
+        })
+    }
+
+    fn frame(&self, place: usize) -> Result<&TrackFrame, StageError> {
+        self.request.frame_at(place).ok_or_else(|| {
+            let message = format!("view '{}': the lease lacks the frame at place {place}", self.request.view);
+            StageError::new(FailureKind::Bug, message)
+        })
+    }
+
+    fn load(&self, place: usize) -> Result<Arc<Image>, StageError> {
+        let frame = self.frame(place)?;
         let bytes = self.runtime.block_on(self.hub.blobs.get(&frame.image.clone().unwrap_or_default()))?;
         let image = Image::decode(&bytes).map_err(|error| {
             let view = &self.request.view;
@@ -156,9 +180,9 @@ impl OwnTracking {
     }
 
     /// Stores and reports a field, unless it is there already.
-    fn emit(&self, index: usize, field: &TrackField) -> Result<(), StageError> {
+    fn emit(&self, place: usize, field: &TrackField) -> Result<(), StageError> {
         go_on(&self.stop)?;
-        let frame = &self.request.frames[index];
+        let frame = self.frame(place)?;
         if frame.tracks.is_some() {
             return Ok(());
         }

@@ -145,7 +145,7 @@ impl Job {
     async fn run_stage(&mut self, state: JobState) -> Result<(), StageError> {
         match state {
             JobState::Ingesting => self.ingest().await,
-            JobState::StaticModel => self.make_static_model().await,
+            JobState::StaticModel => self.make_static_model_beside_tracks().await,
             JobState::Tracking => self.track().await,
             JobState::Frames => self.compute_frames().await,
             JobState::Assembling => self.assemble().await,

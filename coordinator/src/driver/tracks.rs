@@ -1,33 +1,52 @@
 //! Track fields from the key frame to every frame, per training view. Once per clip.
 //!
-//! Own tracks are tasks like frames: workers take them view by view, and the coordinator where no worker may. A frame is
-//! published as soon as every view is tracked to it, so that it is refined while later ones are tracked.
+//! Own tracks are tasks like frames: workers take them view by view, and the coordinator where no worker may. They need
+//! the images only, so workers begin with them while the static model is made. After that a frame is published as soon as
+//! every view is tracked to it, so that it is refined while later ones are tracked.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, future::pending, sync::Arc};
 
 use prost::Message;
-use splat::settings::MotionSource;
+use splat::{formats::track_state, settings::MotionSource, tracking::TrackingSettings};
+use tokio::sync::watch;
 use trackersplat_proto::v1::{Blob, FailureKind, Tracker};
 
 use super::{Job, frames::FrameWork};
 use crate::{
     failure::StageError,
+    hub::Hub,
     keys::{TrackKey, VERSION, digest_of},
-    ledger::{Field, TrackLedger, TrackedView},
+    ledger::{Field, State, TrackLedger, TrackedView},
     model,
+    queue::JobId,
     request::{InputFile, TrackSource},
     store::ViewRecord,
 };
 
 impl Job {
+    /// Makes the static model while workers track.
+    pub(super) async fn make_static_model_beside_tracks(&mut self) -> Result<(), StageError> {
+        if !self.is_tracked() || self.frames.len() < 2 || self.imports_tracks() {
+            return self.make_static_model().await;
+        }
+        self.offer_tracks().await?;
+        let failed = tracks_failed(self.hub.clone(), self.id.clone(), self.changed.clone());
+        tokio::select! {
+            made = self.make_static_model() => made,
+            reason = failed => Err(reason),
+        }
+    }
+
     pub(super) async fn track(&mut self) -> Result<(), StageError> {
-        if !self.is_tracked() || self.frames.len() < 2 {
-            return Ok(());
+        match self.is_tracked() && self.frames.len() >= 2 {
+            false => Ok(()),
+            true if self.imports_tracks() => self.import_tracks().await,
+            true => self.compute_tracks().await,
         }
-        match self.request.tracks {
-            TrackSource::Own | TrackSource::Learned(_) => self.compute_tracks().await,
-            TrackSource::Exact(_) | TrackSource::Files(_) => self.import_tracks().await,
-        }
+    }
+
+    fn imports_tracks(&self) -> bool {
+        matches!(self.request.tracks, TrackSource::Exact(_) | TrackSource::Files(_))
     }
 
     /// Whether the frames of this job start from tracks.
@@ -37,11 +56,19 @@ impl Job {
 
     async fn compute_tracks(&mut self) -> Result<(), StageError> {
         let work = self.frame_work().await?;
-        let ledger = self.ledger().await?;
-        self.hub.begin_tracks(&self.id, &self.stop, ledger).await?;
+        self.offer_tracks().await?;
         tokio::try_join!(self.publish_tracked(&work), self.track_alone())?;
         self.published = self.frames.len();
         Ok(())
+    }
+
+    /// Views that lack fields become ready for workers, once in a run.
+    async fn offer_tracks(&self) -> Result<(), StageError> {
+        if self.hub.has_tracks(&self.id).await {
+            return Ok(());
+        }
+        let ledger = self.ledger().await?;
+        self.hub.begin_tracks(&self.id, &self.stop, ledger).await
     }
 
     /// Publishes every frame, in order, once all views are tracked to it.
@@ -63,7 +90,10 @@ impl Job {
 
     /// What is to be tracked, and what is in the store already.
     pub(super) async fn ledger(&self) -> Result<TrackLedger, StageError> {
-        let settings_json = serde_json::to_string(&self.settings.tracking).map_err(|error| {
+        // However views are cut, their fields are the same.
+        let window = TrackingSettings::default().window;
+        let uncut = TrackingSettings { window, ..self.settings.tracking.clone() };
+        let settings_json = serde_json::to_string(&uncut).map_err(|error| {
             StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
         })?;
         let tracker = match &self.request.tracks {
@@ -80,7 +110,8 @@ impl Job {
         for (position, view) in (0..).zip(&views).filter(|(_, view)| !view.held_out) {
             tracked.insert(position, self.tracked_view(position, view, &tracker).await?);
         }
-        Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, tracked))
+        let reach = self.settings.tracking.reach() as usize;
+        Ok(TrackLedger::new(self.id.clone(), self.key_frame(), tracker, reach, tracked))
     }
 
     /// The network in the store, where workers find it.
@@ -107,7 +138,10 @@ impl Job {
             let message = format!("the stored images of view '{}' are gone; submit the job again", view.name);
             StageError::new(FailureKind::Transient, message)
         })?;
-        let mut fields = Vec::new();
+        let size = (view.camera.width, view.camera.height);
+        let window = self.window(size);
+        let (mut fields, mut states) = (Vec::new(), Vec::new());
+        let last = images.len();
         // A network is known by its bytes, whatever its file is called.
         let nameless = Tracker { model_name: String::new(), ..tracker.clone() };
         let tracker = blake3::hash(&nameless.encode_to_vec()).to_hex().to_string();
@@ -125,9 +159,20 @@ impl Job {
             };
             let tracks: Option<Blob> = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
             fields.push(Field { frame, image, key, tracks });
+            if index % window == 0 && index < last {
+                let key = digest_of(&("track state", VERSION, &own_key));
+                let blob = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
+                states.push(State { key, blob });
+            }
         }
-        let size = (view.camera.width, view.camera.height);
-        Ok(TrackedView { name: view.name.clone(), size, key_image, fields })
+        Ok(TrackedView { name: view.name.clone(), size, key_image, fields, window, states })
+    }
+
+    /// Frames per lease of views of a size. Views whose states would be too large for a blob are not cut.
+    fn window(&self, (width, height): (u32, u32)) -> usize {
+        let tracking = &self.settings.tracking;
+        let state = track_state::uncompressed_bytes(width, height, tracking.reach());
+        if state > track_state::MAX_BYTES { usize::MAX } else { tracking.window.max(1) as usize }
     }
 
     /// Key of the imported tracks of one view to the frame of an index.
@@ -136,5 +181,18 @@ impl Job {
         let clip = &self.record.clip_digest;
         let frames = &self.frames[..=index];
         Ok(digest_of(&TrackKey { kind: "imported tracks", version: VERSION, source, clip, frames, view }))
+    }
+}
+
+/// Why a view cannot be tracked, once one cannot. A run that is stopped meanwhile ends by itself.
+async fn tracks_failed(hub: Arc<Hub>, id: JobId, mut changed: watch::Receiver<()>) -> StageError {
+    loop {
+        changed.borrow_and_update();
+        if let Err(error @ StageError::Failed(_)) = hub.tracks(&id, |_| ()).await {
+            return error;
+        }
+        if changed.changed().await.is_err() {
+            return pending().await;
+        }
     }
 }

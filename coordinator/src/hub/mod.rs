@@ -9,6 +9,7 @@ mod jobs;
 mod reports;
 mod sessions;
 mod tracks;
+mod windows;
 
 use std::{
     collections::{BTreeMap, HashMap},

@@ -60,6 +60,9 @@ impl Hub {
                     self.succeeded(&lease, run, success).await?
                 }
                 (Task::Tracks(_), Some(Outcome::Tracked(tracked))) => self.tracked(&lease, tracked).await?,
+                (Task::Tracks(_), Some(Outcome::Failure(reason))) => {
+                    self.window_failed(&lease, reason).await?
+                }
                 (_, outcome) => self.failed(&lease_id, attempt, reason_of(outcome)).await?,
             },
             (Err(stale), Some(Outcome::Success(_) | Outcome::Tracked(_))) => {

@@ -194,7 +194,7 @@ impl Hub {
         let task = match lease.key.task {
             Task::Frame(frame) => Some(lease::Task::Frame(self.frame_job(job, frame).await?)),
             // Without tracks to be made there would be no lease of them.
-            Task::Tracks(position) => desk.track_job(job, position).map(lease::Task::Tracks),
+            Task::Tracks(position) => self.track_job(desk, job, position).await?.map(lease::Task::Tracks),
         };
         let likely_next = match desk.queue.likely_next(&lease).map(|next| (next.job.clone(), next.task)) {
             Some((job, Task::Frame(frame))) => self

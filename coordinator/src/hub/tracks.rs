@@ -1,4 +1,4 @@
-//! Tracks of views: given out, reported field by field, complete.
+//! Tracks of views: given out window by window, reported field by field, complete.
 
 use std::time::Instant;
 
@@ -12,9 +12,9 @@ use trackersplat_proto::v1::{
 use super::{Desk, Hub};
 use crate::{
     failure::{StageError, failure},
-    ledger::{Place, TrackLedger},
+    ledger::{Place, State, TrackLedger},
     queue::{
-        JobId, Lease, SessionId, Task, TaskKey,
+        JobId, Lease, SessionId, Task, TaskHistory, TaskKey,
         task::{TaskState, TaskTrigger},
     },
     store::{Artifact, AttemptOutcome, StoreError, TaskEvent, TaskRecord},
@@ -51,6 +51,11 @@ impl Hub {
             self.publish_tracks(&mut desk, job, position).await?;
         }
         Ok(self.dispatch(&mut desk).await?)
+    }
+
+    /// Whether views have become ready in this run of the job.
+    pub(crate) async fn has_tracks(&self, job: &JobId) -> bool {
+        self.desk.lock().await.ledger(job).is_some()
     }
 
     /// Fields that an earlier attempt or another job has made complete a view without a lease.
@@ -92,11 +97,9 @@ impl Hub {
         }
         change.commit().await?;
         self.tell_stored(job);
-        let history = match self.store.task(&key).await? {
-            Some(record) => record.history()?,
-            None => return Ok(()),
-        };
-        desk.queue.add(key, history);
+        let Some(record) = self.store.task(&key).await? else { return Ok(()) };
+        let before = desk.ledger(job).map_or(0, |ledger| ledger.before(position));
+        desk.queue.add(key, TaskHistory { before, ..record.history()? });
         Ok(())
     }
 
@@ -142,8 +145,25 @@ impl Hub {
         let id = uuid::Uuid::now_v7().simple().to_string();
         let Some(lease) = desk.queue.lease_own(job, Instant::now(), id) else { return Ok(None) };
         self.record_grant(&lease).await?;
-        let position = lease.key.task.number();
-        Ok(desk.track_job(job, position).map(|request| (lease, request)))
+        let request = self.track_job(&mut desk, job, lease.key.task.number()).await?;
+        Ok(request.map(|request| (lease, request)))
+    }
+
+    /// What whoever leases a view gets.
+    pub(super) async fn track_job(
+        &self,
+        desk: &mut Desk,
+        job: &JobId,
+        position: u32,
+    ) -> Result<Option<TrackJob>, StoreError> {
+        let Some(ledger) = desk.ledger_mut(job) else { return Ok(None) };
+        while let Some(State { key, blob: Some(blob) }) = ledger.next_state(position)
+            && !self.blobs.holds(&blob).await
+        {
+            tracing::warn!(job_id = %job, position, "the tracker's state is gone from the store");
+            ledger.lose_state(position, &key);
+        }
+        Ok(ledger.lease(position))
     }
 
     /// The coordinator has made a field under its own lease.
@@ -151,15 +171,15 @@ impl Hub {
         self.keep_field(lease, &field).await?.map_err(StageError::Failed)
     }
 
-    /// The coordinator's own lease has ended.
+    /// The coordinator's own lease has ended, well with the state after it if that is wanted.
     pub(crate) async fn own_ended(
         &self,
         lease: &Lease,
-        ended: Result<(), Failure>,
+        ended: Result<Option<Blob>, Failure>,
     ) -> Result<(), StageError> {
         let stale = match ended {
-            Ok(()) => self.tracked(lease, Tracked::default()).await?,
-            Err(reason) => self.failed(&lease.id, lease.attempt, reason).await?,
+            Ok(state) => self.tracked(lease, Tracked { fields: Vec::new(), state }).await?,
+            Err(reason) => self.window_failed(lease, reason).await?,
         };
         if let Some(reason) = stale {
             tracing::info!(lease_id = lease.id, reason, "own tracks do not count");
@@ -195,7 +215,7 @@ impl Hub {
         self.dispatch(&mut desk).await
     }
 
-    /// `None` if the tracks of the lease's view are complete, else why they do not count.
+    /// `None` if the window of the lease is complete, else why its tracks do not count.
     pub(super) async fn tracked(
         &self,
         lease: &Lease,
@@ -206,29 +226,46 @@ impl Hub {
                 return self.refused(&lease.id, lease.attempt, reason).await;
             }
         }
-        let position = lease.key.task.number();
-        let mut desk = self.desk.lock().await;
-        if let Some(frame) = desk.ledger(&lease.key.job).and_then(|ledger| ledger.missing(position)) {
-            drop(desk);
-            let reason =
-                failure(FailureKind::Bug, format!("the worker's report lacks the tracks to frame {frame}"));
+        if let Some(state) = &tracked.state
+            && let Err(reason) = self.keep_state(lease, state).await?
+        {
             return self.refused(&lease.id, lease.attempt, reason).await;
         }
-        match desk.queue.commit(&lease.id, lease.attempt) {
-            Ok(lease) => self.record_tracked(&mut desk, &lease).await.map(|()| None),
+        let position = lease.key.task.number();
+        let mut desk = self.desk.lock().await;
+        let ledger = desk.ledger(&lease.key.job);
+        if let Some(lack) = ledger.and_then(|ledger| ledger.lacks(position)) {
+            drop(desk);
+            let reason = failure(FailureKind::Bug, format!("the worker's report lacks {lack}"));
+            return self.refused(&lease.id, lease.attempt, reason).await;
+        }
+        let next = ledger.and_then(|ledger| ledger.missing(position).map(|_| ledger.before(position)));
+        let ended = match next {
+            Some(before) => desk.queue.go_on(&lease.id, lease.attempt, before),
+            None => desk.queue.commit(&lease.id, lease.attempt),
+        };
+        match ended {
+            Ok(lease) if next.is_some() => self.record_window(&mut desk, &lease).await?,
+            Ok(lease) => self.record_tracked(&mut desk, &lease).await?,
             Err(stale) => {
                 drop(desk);
-                self.stale_success(&lease.id, lease.attempt, &stale).await
+                return self.stale_success(&lease.id, lease.attempt, &stale).await;
             }
         }
+        let ledger = desk.ledger_mut(&lease.key.job);
+        let superseded = ledger.map(|ledger| ledger.take_superseded(position));
+        self.discard_states(&superseded.unwrap_or_default()).await?;
+        Ok(None)
     }
 
     async fn record_tracked(&self, desk: &mut Desk, lease: &Lease) -> Result<(), StoreError> {
         let (job, position) = (&lease.key.job, lease.key.task.number());
         let seconds = Instant::now().saturating_duration_since(lease.since).as_secs_f64();
+        let before = self.store.task(&lease.key).await?.map_or(0.0, |record| record.seconds);
         let mut change = self.store.change().await?;
         change.end_attempt(&lease.id, AttemptOutcome::Done).await?;
         change.commit_tracks(job, position, seconds).await?;
+        let seconds = before + seconds;
         let event = TaskEvent {
             attempt: lease.attempt,
             worker: &lease.worker_id,
@@ -319,11 +356,11 @@ impl Hub {
 }
 
 impl Desk {
-    fn ledger(&self, job: &JobId) -> Option<&TrackLedger> {
+    pub(super) fn ledger(&self, job: &JobId) -> Option<&TrackLedger> {
         self.active.get(job)?.tracks.as_ref()
     }
 
-    fn ledger_mut(&mut self, job: &JobId) -> Option<&mut TrackLedger> {
+    pub(super) fn ledger_mut(&mut self, job: &JobId) -> Option<&mut TrackLedger> {
         self.active.get_mut(job)?.tracks.as_mut()
     }
 
@@ -332,11 +369,6 @@ impl Desk {
         let ledger =
             ledger.ok_or_else(|| failure(FailureKind::Transient, "the job is not ready for results"))?;
         ledger.place(position, field).map_err(|message| failure(FailureKind::Bug, message))
-    }
-
-    /// What a worker gets that is to track a view.
-    pub(super) fn track_job(&self, job: &JobId, position: u32) -> Option<TrackJob> {
-        self.ledger(job)?.task(position)
     }
 
     /// Name of a tracked view; empty if nothing is known of it.

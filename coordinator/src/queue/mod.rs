@@ -66,6 +66,8 @@ pub struct TaskHistory {
     pub failures: u32,
     /// Workers that lack the resources for it.
     pub excluded: BTreeSet<String>,
+    /// Of tracks: the frame before which their next window goes out. 0: before every frame.
+    pub before: u32,
 }
 
 #[derive(Debug, Default)]
@@ -74,6 +76,17 @@ struct OpenTask {
     /// Workers that were lost with it: others are preferred.
     avoided: BTreeSet<String>,
     lease: Option<String>,
+}
+
+impl OpenTask {
+    /// Tasks go out by ascending rank: those of the oldest job first, by frames, and tracks before what waits for them.
+    fn rank<'a>(&self, key: &'a TaskKey) -> (&'a JobId, u32, Task) {
+        let before = match key.task {
+            Task::Tracks(_) => self.history.before,
+            Task::Frame(number) => number,
+        };
+        (&key.job, before, key.task)
+    }
 }
 
 #[derive(Debug)]
@@ -182,7 +195,7 @@ impl Queue {
         }
     }
 
-    /// Gives ready tasks to waiting workers, first come first served; tasks in the order of their keys.
+    /// Gives ready tasks to waiting workers, first come first served; tasks in the order of their ranks.
     pub fn assign(&mut self, now: Instant, mut new_lease_id: impl FnMut() -> String) -> Vec<Lease> {
         let mut waiting: Vec<(u64, SessionId)> = self
             .sessions
@@ -206,7 +219,7 @@ impl Queue {
         let Session { worker_id, incarnation, .. } = self.sessions.get(&session_id)?;
         let holder =
             Holder { worker_id: worker_id.clone(), incarnation: incarnation.clone(), session: session_id };
-        let key = self.ready().find(|(_, task)| self.may_take(task, &holder.worker_id))?.0.clone();
+        let key = self.first(|_, task| self.may_take(task, &holder.worker_id))?.clone();
         let lease = self.give(key, holder, now, new_lease_id())?;
         let session = self.sessions.get_mut(&session_id)?;
         session.ticket = None;
@@ -233,11 +246,16 @@ impl Queue {
         if self.sessions.is_empty() && now < self.alone_since + self.policy.reconnect_grace {
             return None;
         }
-        let is_left = |(key, task): &(&TaskKey, &OpenTask)| {
+        self.first(|key, task| {
             let of_job = &*key.job == job && matches!(key.task, Task::Tracks(_));
             of_job && !self.is_servable(task) && !task.history.excluded.contains(OWN_NAME)
-        };
-        self.ready().find(is_left).map(|(key, _)| key)
+        })
+    }
+
+    /// The ready task that goes out before all others that may.
+    fn first(&self, may: impl Fn(&TaskKey, &OpenTask) -> bool) -> Option<&TaskKey> {
+        let ready = self.ready().filter(|(key, task)| may(key, task));
+        ready.min_by_key(|&(key, task)| task.rank(key)).map(|(key, _)| key)
     }
 
     fn give(&mut self, key: TaskKey, holder: Holder, now: Instant, id: String) -> Option<Lease> {
@@ -266,8 +284,10 @@ impl Queue {
         let age = |lease: &Lease| (lease.since, lease.key.clone());
         let of_workers = self.leases.values().filter(|other| other.session != SessionId::OWN);
         let older = of_workers.filter(|other| age(other) < age(lease)).count();
-        let may_take = |task: &OpenTask| self.may_take(task, &lease.worker_id);
-        self.ready().filter(|(_, task)| may_take(task)).nth(older).map(|(key, _)| key)
+        let mut ready: Vec<_> =
+            self.ready().filter(|(_, task)| self.may_take(task, &lease.worker_id)).collect();
+        ready.sort_by_key(|&(key, task)| task.rank(key));
+        ready.get(older).map(|(key, _)| *key)
     }
 
     fn ready(&self) -> impl Iterator<Item = (&TaskKey, &OpenTask)> {
@@ -325,6 +345,18 @@ impl Queue {
         self.in_force(lease_id, attempt)?;
         let lease = self.end(lease_id).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))?;
         self.tasks.remove(&lease.key);
+        Ok(lease)
+    }
+
+    /// The lease has ended without an end of the task, and without a failure: the task is ready again. `before` as in
+    /// [`TaskHistory`].
+    pub fn go_on(&mut self, lease_id: &str, attempt: u32, before: u32) -> Result<Lease, Stale> {
+        self.in_force(lease_id, attempt)?;
+        let lease = self.end(lease_id).ok_or_else(|| Stale::NotHeld(lease_id.to_owned()))?;
+        if let Some(task) = self.tasks.get_mut(&lease.key) {
+            task.history.before = before;
+            task.lease = None;
+        }
         Ok(lease)
     }
 

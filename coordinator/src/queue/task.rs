@@ -4,7 +4,7 @@ use trackersplat_proto::v1;
 
 use super::JobId;
 
-/// A unit of work. Sorts in the order in which tasks are given out: tracks first, as frames wait for them.
+/// A unit of work.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Task {
     /// The tracks of the view at this position in the clip.
@@ -67,6 +67,8 @@ pub enum TaskTrigger {
     Commit,
     /// The attempt failed and another one is due.
     Retry,
+    /// A part of the task is committed, and another part is left.
+    Continue,
     /// No other attempt is due.
     GiveUp,
     /// The lease is void through no fault of the task: the worker drains, or the coordinator was restarted.
@@ -95,11 +97,11 @@ impl TaskState {
 
     /// The state after a trigger.
     pub fn after(self, trigger: TaskTrigger) -> Result<Self, IllegalTaskTransition> {
-        use TaskTrigger::{Cancel, Commit, GiveUp, Lease, Lose, Release, Resubmit, Retry};
+        use TaskTrigger::{Cancel, Commit, Continue, GiveUp, Lease, Lose, Release, Resubmit, Retry};
         match (self, trigger) {
             (Self::Ready, Lease) => Ok(Self::Leased),
             (Self::Ready | Self::Leased, Commit) => Ok(Self::Done),
-            (Self::Leased, Retry | Release) => Ok(Self::Ready),
+            (Self::Leased, Retry | Release | Continue) => Ok(Self::Ready),
             (Self::Ready | Self::Leased, GiveUp) => Ok(Self::Failed),
             (Self::Ready | Self::Leased, Cancel) => Ok(Self::Cancelled),
             (Self::Failed | Self::Cancelled, Resubmit) | (Self::Done, Lose) => Ok(Self::Ready),
@@ -156,6 +158,7 @@ mod tests {
             (Leased, Commit, Done),
             (Leased, Retry, Ready),
             (Leased, Release, Ready),
+            (Leased, Continue, Ready),
             (Leased, GiveUp, Failed),
             (Leased, Cancel, Cancelled),
             (Failed, Resubmit, Ready),
@@ -163,7 +166,7 @@ mod tests {
             (Done, Lose, Ready),
         ];
         for state in TaskState::ALL {
-            for trigger in [Lease, Commit, Retry, GiveUp, Release, Cancel, Resubmit, Lose] {
+            for trigger in [Lease, Commit, Retry, Continue, GiveUp, Release, Cancel, Resubmit, Lose] {
                 let listed = legal.iter().find(|row| row.0 == state && row.1 == trigger).map(|row| row.2);
                 match state.after(trigger) {
                     Ok(next) => assert_eq!(Some(next), listed, "{state:?} {trigger:?}"),

@@ -376,7 +376,7 @@ fn no_frame_is_beyond_all_workers_while_one_may_come_back() {
 fn attempts_go_on_from_the_history() {
     let mut bench = Bench::new([]);
     let excluded = BTreeSet::from(["small".to_owned()]);
-    bench.queue.add(key(1), TaskHistory { attempts: 4, failures: 2, excluded });
+    bench.queue.add(key(1), TaskHistory { attempts: 4, failures: 2, excluded, before: 0 });
     bench.connect(1, "small");
     assert_eq!(bench.assign(), []);
     bench.connect(2, "w");
@@ -486,6 +486,61 @@ fn a_task_that_gets_on_has_all_its_attempts_again() {
         assert!(bench.fail(&lease, FailureKind::Transient).retried);
     }
     for retried in [true, false] {
+        let lease = bench.assign_one();
+        assert_eq!(bench.fail(&lease, FailureKind::Transient).retried, retried);
+    }
+}
+
+fn before(frame: u32) -> TaskHistory {
+    TaskHistory { before: frame, ..TaskHistory::default() }
+}
+
+#[test]
+fn windows_go_out_view_after_view_and_a_window_ahead_of_the_frames() {
+    let mut bench = Bench::new([1, 2, 3, 4]);
+    bench.queue.add(tracks(0), before(2));
+    bench.queue.add(tracks(1), before(0));
+    bench.connect(1, "w");
+    let mut order = Vec::new();
+    for next in [2, 4, 4, 5, 5, 5, 5, 5] {
+        let lease = bench.assign_one();
+        order.push(lease.key.task);
+        let hint = bench.queue.likely_next(&lease).cloned();
+        if let Task::Frame(_) = lease.key.task {
+            bench.queue.commit(&lease.id, lease.attempt).expect("it is held");
+        } else {
+            bench.queue.go_on(&lease.id, lease.attempt, next).expect("it is held");
+            assert_ne!(hint, Some(lease.key.clone()), "it is leased");
+        }
+        bench.queue.park(lease.session);
+    }
+    let expected = [
+        Task::Tracks(1),
+        Task::Frame(1),
+        Task::Tracks(0),
+        Task::Tracks(1),
+        Task::Frame(2),
+        Task::Frame(3),
+        Task::Tracks(0),
+        Task::Frame(4),
+    ];
+    assert_eq!(order, expected);
+}
+
+#[test]
+fn a_window_that_is_done_is_no_failure_and_its_lease_is_dead() {
+    let mut bench = Bench::new([]);
+    bench.queue.add(tracks(0), TaskHistory::default());
+    bench.connect(1, "w");
+    for attempt in 1..=9 {
+        let lease = bench.assign_one();
+        assert_eq!(lease.attempt, attempt);
+        bench.queue.go_on(&lease.id, attempt, attempt).expect("it is held");
+        let stale = Err(Stale::NotHeld(lease.id.clone()));
+        assert_eq!(bench.queue.go_on(&lease.id, attempt, 0), stale);
+        bench.queue.park(lease.session);
+    }
+    for retried in [true, true, false] {
         let lease = bench.assign_one();
         assert_eq!(bench.fail(&lease, FailureKind::Transient).retried, retried);
     }

@@ -20,6 +20,12 @@ impl Store {
         let row: Option<(String, i64, String)> = query.fetch_optional(&self.pool).await?;
         Ok(row.map(|(digest, size, note)| Artifact { blob: Blob { digest, size: unsigned(size) }, note }))
     }
+
+    /// Whether a blob is the content of any artifact.
+    pub async fn is_artifact(&self, blob: &Blob) -> Result<bool, StoreError> {
+        let sql = "SELECT EXISTS (SELECT 1 FROM artifacts WHERE digest = ?)";
+        Ok(sqlx::query_scalar(sql).bind(&blob.digest).fetch_one(&self.pool).await?)
+    }
 }
 
 impl Change {
@@ -35,6 +41,12 @@ impl Change {
         let query = sqlx::query(sql).bind(key).bind(kind).bind(&artifact.blob.digest);
         let query = query.bind(signed(artifact.blob.size)).bind(&artifact.note);
         query.execute(&mut *self.transaction).await?;
+        Ok(())
+    }
+
+    /// Forgets an artifact that nobody needs any more, or whose bytes are gone.
+    pub async fn remove_artifact(&mut self, key: &str) -> Result<(), StoreError> {
+        sqlx::query("DELETE FROM artifacts WHERE key = ?").bind(key).execute(&mut *self.transaction).await?;
         Ok(())
     }
 }

@@ -60,7 +60,7 @@ impl TaskRecord {
     pub fn history(&self) -> Result<TaskHistory, StoreError> {
         let excluded: BTreeSet<String> = serde_json::from_str(&self.excluded)
             .map_err(|_| StoreError::Value { place: "tasks.excluded", value: self.excluded.clone() })?;
-        Ok(TaskHistory { attempts: self.attempts, failures: self.failures, excluded })
+        Ok(TaskHistory { attempts: self.attempts, failures: self.failures, excluded, before: 0 })
     }
 }
 
@@ -135,11 +135,27 @@ impl Change {
         Ok(())
     }
 
-    /// The tracks of a view are complete.
+    /// The tracks of a view are complete, after so many seconds of the last lease.
     pub async fn commit_tracks(&mut self, job: &str, position: u32, seconds: f64) -> Result<(), StoreError> {
         let task = Task::Tracks(position);
         self.set_task_state(job, task, TaskState::Done).await?;
-        let sql = "UPDATE tasks SET seconds = ? WHERE job_id = ? AND kind = ? AND number = ?";
+        self.add_seconds(job, task, seconds).await
+    }
+
+    /// A window of the tracks of a view is complete, and another one is left: the view is ready again.
+    pub async fn continue_tracks(
+        &mut self,
+        key: &TaskKey,
+        attempt: u32,
+        worker: &str,
+        seconds: f64,
+    ) -> Result<(), StoreError> {
+        self.add_seconds(&key.job, key.task, seconds).await?;
+        self.release_task(key, attempt, worker).await
+    }
+
+    async fn add_seconds(&mut self, job: &str, task: Task, seconds: f64) -> Result<(), StoreError> {
+        let sql = "UPDATE tasks SET seconds = seconds + ? WHERE job_id = ? AND kind = ? AND number = ?";
         let query = sqlx::query(sql).bind(seconds).bind(job).bind(task.kind()).bind(task.number());
         query.execute(&mut *self.transaction).await?;
         Ok(())
@@ -239,7 +255,7 @@ impl Change {
         rows.into_iter().map(orphan).collect()
     }
 
-    /// A lease is void through no fault of the task: it is ready again.
+    /// A lease has ended through no fault of the task, which is not done: it is ready again.
     pub async fn release_task(
         &mut self,
         key: &TaskKey,

@@ -70,6 +70,7 @@ impl Engine for BackgroundEngine {
 pub(super) struct Bench {
     pub(super) folder: tempfile::TempDir,
     pub(super) options: ServeOptions,
+    engine: Arc<dyn Engine>,
     running: Option<(Running, CancellationToken)>,
     pub(super) channel: Option<Channel>,
 }
@@ -80,6 +81,10 @@ impl Bench {
     }
 
     pub(super) async fn start_with(adjust: impl FnOnce(&mut ServeOptions)) -> Self {
+        Self::start_on(Arc::new(BackgroundEngine), adjust).await
+    }
+
+    pub(super) async fn start_on(engine: Arc<dyn Engine>, adjust: impl FnOnce(&mut ServeOptions)) -> Self {
         let folder = tempfile::tempdir().unwrap();
         write_clip(&folder.path().join("clip"), 0);
         std::fs::write(folder.path().join("static.ply"), ply::write_ply(&model(0.0))).unwrap();
@@ -94,7 +99,7 @@ impl Bench {
             ..ServeOptions::default()
         };
         adjust(&mut options);
-        let mut bench = Self { folder, options, running: None, channel: None };
+        let mut bench = Self { folder, options, engine, running: None, channel: None };
         bench.restart().await;
         bench
     }
@@ -102,8 +107,7 @@ impl Bench {
     /// Starts the coordinator, after it was stopped or killed.
     pub(super) async fn restart(&mut self) {
         let shutdown = CancellationToken::new();
-        let running =
-            serve(self.options.clone(), Arc::new(BackgroundEngine), shutdown.clone()).await.unwrap();
+        let running = serve(self.options.clone(), self.engine.clone(), shutdown.clone()).await.unwrap();
         let endpoint =
             tonic::transport::Endpoint::from_shared(format!("http://{}", running.address)).unwrap();
         self.channel = Some(endpoint.connect().await.unwrap());
@@ -112,7 +116,7 @@ impl Bench {
 
     /// Starts another coordinator on the same folder.
     pub(super) async fn try_second(&self) -> Result<Running, ServeError> {
-        serve(self.options.clone(), Arc::new(BackgroundEngine), CancellationToken::new()).await
+        serve(self.options.clone(), self.engine.clone(), CancellationToken::new()).await
     }
 
     pub(super) async fn stop(&mut self) {
@@ -379,10 +383,15 @@ pub(super) fn model(x: f32) -> Gaussians {
     }
 }
 
-/// A clip in the nerfstudio layout with one file per frame.
+/// A clip of three frames in the nerfstudio layout with one file per frame.
 pub(super) fn write_clip(root: &Path, shade: u8) {
+    write_clip_of(3, root, shade);
+}
+
+/// [`write_clip`] of any number of frames.
+pub(super) fn write_clip_of(frames: u32, root: &Path, shade: u8) {
     std::fs::create_dir_all(root.join("transforms")).unwrap();
-    for frame in 1..=3_u32 {
+    for frame in 1..=frames {
         let mut views = Vec::new();
         for (index, name) in ["cam00", "cam01", "cam02", "test00"].into_iter().enumerate() {
             let folder = root.join("images").join(name);

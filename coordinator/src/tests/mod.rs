@@ -1,5 +1,6 @@
 //! The coordinator over loopback, with workers that speak the protocol by hand.
 
+mod early_tracks;
 mod harness;
 mod jobs;
 mod learned;
@@ -13,3 +14,4 @@ mod runs;
 mod track_files;
 mod tracks;
 mod transfers;
+mod windows;

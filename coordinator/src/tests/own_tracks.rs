@@ -39,7 +39,8 @@ async fn tracking_alone(bench: &Bench) -> (String, Watch, mpsc::Sender<()>) {
     let idle = bench.worker("idle").await;
     let job = bench.submit(tracked_request(bench)).await.unwrap().job_id;
     let mut watch = bench.watch(&job, 0).await;
-    watch.until(|event| matches!(event, Event::TracksState(t) if t.view == "cam02")).await;
+    // The key frame is given out once the static model is there and the views are ready.
+    watch.until(|event| matches!(event, Event::FrameState(f) if f.frame == 1)).await;
     let busy = occupy(bench).await;
     drop(idle);
     let leased = |event: &Event| matches!(event, Event::TracksState(t) if t.state() == TaskState::Leased);

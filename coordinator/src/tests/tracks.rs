@@ -49,7 +49,7 @@ async fn cancelled(worker: &mut Worker) -> CancelLease {
 /// Says the fields to frames 2 and 3 and that the view is complete.
 pub(super) async fn track_honestly(bench: &Bench, worker: &mut Worker, lease: &Lease) {
     let fields = vec![field(bench, 2).await, field(bench, 3).await];
-    let receipt = worker.report(lease, Outcome::Tracked(Tracked { fields })).await;
+    let receipt = worker.report(lease, Outcome::Tracked(Tracked { fields, state: None })).await;
     assert!(receipt.accepted, "{receipt:?}");
 }
 
@@ -133,7 +133,7 @@ async fn tracks_of_a_lost_worker_go_on_with_the_fields_that_it_had_stored() {
     bench.stop().await;
     bench.restart().await;
     let mut heir = bench.worker("w1").await;
-    let stale = Tracked { fields: vec![field(&bench, 3).await] };
+    let stale = Tracked { fields: vec![field(&bench, 3).await], state: None };
     assert!(!heir.report(&again, Outcome::Tracked(stale.clone())).await.accepted);
     assert_eq!(bench.ended_tracking(&job, &mut heir).await, ["cam00", "cam01", "cam02"]);
 }
@@ -158,17 +158,19 @@ async fn fields_that_do_not_verify_or_differ_fail_the_attempt() {
     let lease = worker.lease().await;
     assert!(track_job(&lease).frames.iter().all(|frame| frame.tracks.is_none()));
     let mut fields = vec![field(&bench, 2).await];
-    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields: fields.clone() })).await;
+    let receipt =
+        worker.report(&lease, Outcome::Tracked(Tracked { fields: fields.clone(), state: None })).await;
     assert!(!receipt.accepted && receipt.reason.contains("lacks the tracks to frame 3"), "{receipt:?}");
 
     let lease = worker.lease().await;
     assert_eq!(track_job(&lease).frames[1].tracks, fields[0].tracks, "what was verified counts");
     fields[0].tracks = Some(bench.put(encoded(8, 7.0)).await);
-    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields: fields.clone() })).await;
+    let receipt =
+        worker.report(&lease, Outcome::Tracked(Tracked { fields: fields.clone(), state: None })).await;
     assert!(!receipt.accepted && receipt.reason.contains("was reported before"), "{receipt:?}");
     let lease = worker.lease().await;
     assert_eq!(lease.attempt, 4, "the failure before the field was kept does not count any more");
-    assert!(!worker.report(&lease, Outcome::Tracked(Tracked { fields })).await.accepted);
+    assert!(!worker.report(&lease, Outcome::Tracked(Tracked { fields, state: None })).await.accepted);
     let (state, failure) = bench.ended(&job).await;
     let failure = failure.unwrap();
     assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::Bug), "the third failure since");
@@ -252,10 +254,10 @@ async fn of_two_jobs_that_track_the_same_view_the_first_field_counts_for_both() 
     let different = TrackedField { frame: 2, tracks: Some(bench.put(encoded(8, 9.0)).await) };
     say(&slow, &lease, different.clone()).await;
     let fields = vec![different, field(&bench, 3).await];
-    let receipt = slow.report(&lease, Outcome::Tracked(Tracked { fields })).await;
+    let receipt = slow.report(&lease, Outcome::Tracked(Tracked { fields, state: None })).await;
     assert!(receipt.accepted, "{receipt:?}");
-    let known = bench.hub().tracks(&job.as_str().into(), |ledger| ledger.task(0)).await.unwrap().unwrap();
-    assert_eq!(known.frames[1].tracks, first.tracks);
+    let known = bench.hub().tracks(&job.as_str().into(), |ledger| ledger.tracks(0, 2)).await.unwrap();
+    assert_eq!(known, first.tracks);
     track_honestly(&bench, &mut fast, &theirs).await;
 }
 
@@ -275,7 +277,7 @@ impl Bench {
             for frame in request.frames.iter().skip(1).filter(|frame| frame.tracks.is_none()) {
                 fields.push(field(self, frame.frame).await);
             }
-            let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields })).await;
+            let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields, state: None })).await;
             assert!(receipt.accepted, "{receipt:?}");
         }
         assert_eq!(self.ended(job).await.0, JobState::Done);

@@ -12,6 +12,29 @@ pub(crate) fn undo_zigzag(zigzag: u32, old: u32) -> u32 {
     old.wrapping_add(zigzag >> 1 ^ (zigzag & 1).wrapping_neg())
 }
 
+/// Every value minus its left neighbour, the first of a row minus the one above it.
+pub(crate) fn row_differences(values: &[u32], width: usize) -> Vec<u32> {
+    (0..values.len())
+        .map(|index| zigzag_difference(values[index], predecessor(values, index, width)))
+        .collect()
+}
+
+/// Undoes [`row_differences`].
+pub(crate) fn undo_row_differences(mut differences: Vec<u32>, width: usize) -> Vec<u32> {
+    for index in 0..differences.len() {
+        differences[index] = undo_zigzag(differences[index], predecessor(&differences, index, width));
+    }
+    differences
+}
+
+fn predecessor(values: &[u32], index: usize, width: usize) -> u32 {
+    match (index % width, index / width) {
+        (0, 0) => 0,
+        (0, _) => values[index - width],
+        _ => values[index - 1],
+    }
+}
+
 /// Appends the lowest `PLANES` bytes of all values: first every value's lowest byte, then every next one.
 pub(crate) fn append<const PLANES: usize>(out: &mut Vec<u8>, values: &[u32]) {
     for plane in 0..PLANES {

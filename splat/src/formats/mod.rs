@@ -6,5 +6,6 @@ pub mod ply;
 pub mod track_blob;
 pub mod track_error;
 pub mod track_npz;
+pub mod track_state;
 
 pub use self::track_error::TrackError;

@@ -6,7 +6,7 @@
 
 use super::{
     TrackError,
-    byte_planes::{append, bit, pack_bits, take, undo_zigzag, values, zigzag_difference},
+    byte_planes::{append, bit, pack_bits, row_differences, take, undo_row_differences, values},
     container::{ContainerError, Sealed, seal},
 };
 use crate::tracking::TrackField;
@@ -102,29 +102,6 @@ pub fn decode(bytes: &[u8]) -> Result<TrackField, TrackError> {
         visible: (0..pixels).map(|index| bit(visible, index)).collect(),
         sigma: sigma.into_iter().map(|packed| unpack_sigma(packed as u16)).collect(),
     })
-}
-
-/// Every value minus its left neighbour, the first of a row minus the one above it.
-fn row_differences(values: &[u32], width: usize) -> Vec<u32> {
-    (0..values.len())
-        .map(|index| zigzag_difference(values[index], predecessor(values, index, width)))
-        .collect()
-}
-
-/// Undoes [`row_differences`].
-fn undo_row_differences(mut differences: Vec<u32>, width: usize) -> Vec<u32> {
-    for index in 0..differences.len() {
-        differences[index] = undo_zigzag(differences[index], predecessor(&differences, index, width));
-    }
-    differences
-}
-
-fn predecessor(values: &[u32], index: usize, width: usize) -> u32 {
-    match (index % width, index / width) {
-        (0, 0) => 0,
-        (0, _) => values[index - width],
-        _ => values[index - 1],
-    }
 }
 
 /// A standard deviation as the upper half of its f32 bits, shifted by the sign that it does not have: eight bits of

@@ -20,6 +20,7 @@ mod patches;
 mod planes;
 mod refine;
 mod settings;
+pub(crate) mod state;
 #[cfg(test)]
 mod tests;
 mod texels;
@@ -29,6 +30,7 @@ mod windows;
 
 pub use pair_flow::{DenseFlow, PairFlow, SizesDiffer, pair_flow};
 pub use settings::TrackingSettings;
+pub use state::{StateMisfit, TrackState};
 pub use tracker::Tracker;
 pub use view::track_view;
 

@@ -33,6 +33,10 @@ pub struct TrackingSettings {
     /// 1000, default 1 and 2, with `draft` 1, with `best` 1, 2, 4 and 8.
     #[serde(deserialize_with = "range::gaps")]
     pub gaps: Vec<u32>,
+    /// Frames of a view that a worker tracks before the next view has its turn; 1 to 100 000, default 16. The tracks are
+    /// the same whatever it is.
+    #[serde(deserialize_with = "range::whole::<1, 100_000, _>")]
+    pub window: u32,
     /// Levels whose longer side has more pixels than this are refined without matching patches; 0 to 65 536, default
     /// 400, with `draft` 200, with `best` 1600.
     #[serde(deserialize_with = "range::whole::<0, 65_536, _>")]
@@ -90,6 +94,7 @@ impl TrackingSettings {
             search_radius: 0.4,
             colour: true,
             gaps: vec![1, 2],
+            window: 16,
             patch_side: 400,
             patch_stride: 3,
             patch_iterations: 8,

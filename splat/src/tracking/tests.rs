@@ -10,6 +10,23 @@ use super::*;
 use crate::{image::Image, settings::Quality};
 
 mod pair;
+mod windows;
+
+/// What any error says.
+#[derive(Debug)]
+pub(super) struct Failed(pub(super) String);
+
+impl From<StateMisfit> for Failed {
+    fn from(error: StateMisfit) -> Self {
+        Self(error.to_string())
+    }
+}
+
+impl From<learned::LearnedError> for Failed {
+    fn from(error: learned::LearnedError) -> Self {
+        Self(error.to_string())
+    }
+}
 
 /// Smooth colour noise over the plane: band-limited enough that bilinear interpolation errs by a few grey levels.
 #[derive(Clone)]
@@ -390,6 +407,7 @@ fn extreme_settings_give_finite_tracks() {
         search_radius: 0.0,
         colour: false,
         gaps: vec![0],
+        window: 1,
         patch_side: 0,
         patch_stride: 0,
         patch_iterations: 0,
@@ -482,6 +500,7 @@ fn settings_survive_a_round_trip_and_refuse_unknown_keys() {
         (r#"{"consistency": 0}"#, "above 0"),
         (r#"{"sigma_floor": 0}"#, "above 0"),
         (r#"{"gaps": [1, 0]}"#, "between 1 and 1000"),
+        (r#"{"window": 0}"#, "between 1 and 100000"),
     ] {
         let error = serde_json::from_str::<TrackingSettings>(wrong).unwrap_err().to_string();
         assert!(error.contains(said), "{wrong}: {error}");

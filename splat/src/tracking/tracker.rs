@@ -1,11 +1,11 @@
 //! What tracks a view: the built-in tracker or a network.
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use super::{
-    TrackField, TrackingSettings,
+    StateMisfit, TrackField, TrackState, TrackingSettings,
     learned::{LearnedError, LearnedTracker},
-    view::track_view,
+    view::{track_view, track_window},
 };
 use crate::image::Image;
 
@@ -33,25 +33,30 @@ impl Tracker {
         settings: &TrackingSettings,
         emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
     ) -> Result<(), E> {
-        self.track_missing(frame_count, &|_| true, load, settings, emit)
+        match self {
+            Self::BuiltIn => track_view(frame_count, load, settings, emit),
+            Self::Learned(tracker) => tracker.track_view(frame_count, load, settings, emit),
+        }
     }
 
-    /// [`Self::track_view`] where the fields of some frames are there already.
+    /// Tracks the frames of a window of a view: from the state before them, which is the empty one where they begin with
+    /// frame 1, to the state after them.
     ///
-    /// Frames that are not wanted and on which no wanted one depends are neither loaded nor tracked. Fields that have to
-    /// be made for the sake of later ones are emitted, wanted or not.
-    pub fn track_missing<E: From<LearnedError>>(
+    /// However a view is cut, the fields are those of [`Self::track_view`] to the last bit. Besides the frames of the
+    /// window, `load` is asked for the key frame and for those that the state names. Fields that are not wanted are
+    /// emitted all the same where later ones depend on them, else their frames are not even loaded.
+    pub fn track_window<E: From<LearnedError> + From<StateMisfit>>(
         &self,
-        frame_count: usize,
+        from: TrackState,
+        frames: Range<usize>,
         is_wanted: &dyn Fn(usize) -> bool,
         load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
         settings: &TrackingSettings,
         emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
-    ) -> Result<(), E> {
-        let needed = (1..frame_count).rev().find(|&index| is_wanted(index)).map_or(0, |last| last + 1);
+    ) -> Result<TrackState, E> {
         match self {
-            Self::BuiltIn => track_view(needed, load, settings, emit),
-            Self::Learned(tracker) => tracker.track_missing(needed, is_wanted, load, settings, emit),
+            Self::BuiltIn => track_window(from, frames, load, settings, emit),
+            Self::Learned(tracker) => tracker.track_window(from, frames, is_wanted, load, settings, emit),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Tracking of one view, frame after frame.
 
-use std::{collections::VecDeque, convert::Infallible, sync::Arc};
+use std::{collections::VecDeque, convert::Infallible, ops::Range, sync::Arc};
 
 use super::{
     TrackField, TrackingSettings, chain,
@@ -10,6 +10,7 @@ use super::{
     flow::{self, Flow},
     matcher::{PairMatcher, PatchSearch, Ways},
     pair::{Frame, Guides},
+    state::{Remembered, StateMisfit, TrackState},
 };
 use crate::image::Image;
 
@@ -34,16 +35,34 @@ pub fn track_view<E>(
 ) -> Result<(), E> {
     let mut loaded = |index: usize| load(index).map_err(Failure::Caller);
     let mut passed_on = |index: usize, field: TrackField| emit(index, field).map_err(Failure::Caller);
-    track_frames(frame_count, &mut loaded, settings, &PatchSearch, &mut passed_on).map_err(|failure| {
-        match failure {
-            Failure::Caller(error) => error,
-        }
-    })
+    track_whole(frame_count, &mut loaded, settings, &PatchSearch, &mut passed_on)
+        .map_err(Failure::into_caller)
+}
+
+/// Tracks some frames of a view, from the state before them to the state after them, with the built-in tracker.
+pub(super) fn track_window<E: From<StateMisfit>>(
+    from: TrackState,
+    frames: Range<usize>,
+    load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+    settings: &TrackingSettings,
+    emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+) -> Result<TrackState, E> {
+    let mut loaded = |index: usize| load(index).map_err(Failure::Caller);
+    let mut passed_on = |index: usize, field: TrackField| emit(index, field).map_err(Failure::Caller);
+    track_between(from, frames, &mut loaded, settings, &PatchSearch, &mut passed_on)
+        .map_err(Failure::into_caller)
 }
 
 /// What ends the work when the matcher itself cannot fail.
 enum Failure<E> {
     Caller(E),
+}
+
+impl<E> Failure<E> {
+    fn into_caller(self) -> E {
+        let Self::Caller(error) = self;
+        error
+    }
 }
 
 impl<E> From<Infallible> for Failure<E> {
@@ -52,34 +71,103 @@ impl<E> From<Infallible> for Failure<E> {
     }
 }
 
+impl<E: From<StateMisfit>> From<StateMisfit> for Failure<E> {
+    fn from(misfit: StateMisfit) -> Self {
+        Self::Caller(misfit.into())
+    }
+}
+
 /// [`track_view`] with any matcher of pairs.
-pub(super) fn track_frames<E, M: PairMatcher>(
+pub(super) fn track_whole<E: From<M::Error>, M: PairMatcher>(
     frame_count: usize,
     load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
     settings: &TrackingSettings,
     matcher: &M,
     emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
-) -> Result<(), E>
-where
-    E: From<M::Error>,
-{
+) -> Result<(), E> {
     if frame_count < 2 {
         return Ok(());
     }
-    let key_image = load(0)?;
-    let size = (key_image.width, key_image.height);
-    let empty = key_image.pixel_count() == 0;
-    let mut tracker = if empty { None } else { Some(Tracker::new(&key_image, settings, matcher)) };
-    drop(key_image);
-    for index in 1..frame_count {
-        let image = load(index)?;
-        let field = match &mut tracker {
-            Some(tracker) if (image.width, image.height) == size => tracker.track(index, &image)?,
-            _ => unknown(size),
-        };
-        emit(index, field)?;
+    View::open(load, settings, matcher)?.track(1..frame_count, load, emit)
+}
+
+/// [`track_window`] with any matcher of pairs. The empty state is the one right after the key frame.
+pub(super) fn track_between<E, M: PairMatcher>(
+    from: TrackState,
+    frames: Range<usize>,
+    load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+    settings: &TrackingSettings,
+    matcher: &M,
+    emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+) -> Result<TrackState, E>
+where
+    E: From<M::Error> + From<StateMisfit>,
+{
+    let mut view = View::open(load, settings, matcher)?;
+    view.recall(from, frames.start, load)?;
+    view.track(frames.clone(), load, emit)?;
+    Ok(view.state_before(frames.end))
+}
+
+/// A view that is tracked.
+struct View<'a, M> {
+    size: (u32, u32),
+    /// None where the key frame has no pixels.
+    tracker: Option<Tracker<'a, M>>,
+}
+
+impl<'a, M: PairMatcher> View<'a, M> {
+    fn open<E>(
+        load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+        settings: &'a TrackingSettings,
+        matcher: &'a M,
+    ) -> Result<Self, E> {
+        let key = load(0)?;
+        let tracker = (key.pixel_count() > 0).then(|| Tracker::new(&key, settings, matcher));
+        Ok(Self { size: (key.width, key.height), tracker })
     }
-    Ok(())
+
+    /// Remembers the frames before `first` that the state names.
+    fn recall<E: From<StateMisfit>>(
+        &mut self,
+        from: TrackState,
+        first: usize,
+        load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+    ) -> Result<(), E> {
+        let Some(tracker) = &mut self.tracker else { return Ok(()) };
+        let size = [from.width, from.height];
+        for remembered in from.frames {
+            let index = remembered.index as usize;
+            if index >= first {
+                return Err(
+                    StateMisfit(format!("it knows frame {index}, from {first} on is to be tracked")).into()
+                );
+            }
+            tracker.recall(&*load(index)?, size, remembered)?;
+        }
+        Ok(())
+    }
+
+    fn track<E: From<M::Error>>(
+        &mut self,
+        frames: Range<usize>,
+        load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
+        emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
+    ) -> Result<(), E> {
+        for index in frames {
+            let image = load(index)?;
+            let field = match &mut self.tracker {
+                Some(tracker) if (image.width, image.height) == self.size => tracker.track(index, &image)?,
+                _ => unknown(self.size),
+            };
+            emit(index, field)?;
+        }
+        Ok(())
+    }
+
+    fn state_before(self, next: usize) -> TrackState {
+        self.tracker.map_or_else(TrackState::default, |tracker| tracker.state_before(next))
+    }
 }
 
 /// All pixels hidden, where they were.
@@ -137,11 +225,50 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         let field = self.field(&tracks);
 
         self.past.push_back(Past { index, frame, tracks });
-        let longest = self.settings.gaps.iter().copied().max().unwrap_or(0) as usize;
-        while self.past.front().is_some_and(|past| past.index + longest <= index) {
+        self.forget_before(index + 1);
+        Ok(field)
+    }
+
+    /// Forgets what neither frame `next` nor a later one can be chained to.
+    fn forget_before(&mut self, next: usize) {
+        let reach = self.settings.reach() as usize;
+        while self.past.front().is_some_and(|past| past.index + reach < next) {
             self.past.pop_front();
         }
-        Ok(field)
+    }
+
+    /// What tracking goes on from at frame `next`.
+    fn state_before(mut self, next: usize) -> TrackState {
+        // Frames of another size than the key frame pass without a trace.
+        self.forget_before(next);
+        let [width, height] = [self.key.width(), self.key.height()].map(|side| side as u32);
+        let frames: Vec<_> =
+            self.past.into_iter().map(|past| Remembered::of(past.index, past.tracks)).collect();
+        if frames.is_empty() { TrackState::default() } else { TrackState { width, height, frames } }
+    }
+
+    /// Remembers a frame, whose image is `image`, as if it had just been tracked.
+    fn recall(
+        &mut self,
+        image: &Image,
+        [width, height]: [u32; 2],
+        remembered: Remembered,
+    ) -> Result<(), StateMisfit> {
+        let misfit = |what: String| Err(StateMisfit(format!("frame {}: {what}", remembered.index)));
+        if (image.width, image.height) != (self.width, self.height) {
+            return misfit("its image is of another size than the key frame".into());
+        }
+        let size = [self.key.width(), self.key.height()];
+        if [width as usize, height as usize] != size {
+            return misfit(format!(
+                "tracks of {width}x{height}, frames are matched at {}x{}",
+                size[0], size[1]
+            ));
+        }
+        let frame = Frame::new(&self.exposure.equalised(image), self.settings);
+        let index = remembered.index as usize;
+        self.past.push_back(Past { index, frame, tracks: remembered.into_judged(size) });
+        Ok(())
     }
 
     /// Frames that later ones may be chained to.

@@ -1,6 +1,6 @@
 //! Networks that see the key frame and a later one, and say where everything is and what is visible.
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use super::{
     DEFAULT_SIGMA, LearnedError, LearnedTracker,
@@ -15,15 +15,15 @@ use crate::{
 /// Probability from which a pixel counts as visible.
 const VISIBLE: f32 = 0.5;
 
-pub(super) fn track_view<E: From<LearnedError>>(
+pub(super) fn track<E: From<LearnedError>>(
     tracker: &LearnedTracker,
-    frame_count: usize,
+    frames: Range<usize>,
     is_wanted: &dyn Fn(usize) -> bool,
     load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
     settings: &TrackingSettings,
     emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
 ) -> Result<(), E> {
-    let mut wanted = (1..frame_count).filter(|&index| is_wanted(index)).peekable();
+    let mut wanted = frames.filter(|&index| is_wanted(index)).peekable();
     if wanted.peek().is_none() {
         return Ok(());
     }

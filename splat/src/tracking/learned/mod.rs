@@ -27,7 +27,7 @@ mod test_model;
 mod tests;
 mod wire;
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 pub use error::LearnedError;
 use network::Network;
@@ -35,7 +35,7 @@ pub use network::{MAX_MODEL_BYTES, MAX_SIDE};
 pub use settings::{OnnxSettings, ValueRange};
 pub use signature::Signature;
 
-use super::{TrackField, TrackingSettings, view};
+use super::{StateMisfit, TrackField, TrackState, TrackingSettings, view};
 use crate::image::Image;
 
 /// Standard deviation of tracks from networks that state none, pixels of the network's input.
@@ -72,25 +72,31 @@ impl LearnedTracker {
         settings: &TrackingSettings,
         emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
     ) -> Result<(), E> {
-        self.track_missing(frame_count, &|_| true, load, settings, emit)
+        match self.signature() {
+            Signature::PairFlow => view::track_whole(frame_count, load, &self.chained(settings), self, emit),
+            Signature::KeyToFrame => {
+                key_to_frame::track(self, 1..frame_count, &|_| true, load, settings, emit)
+            }
+        }
     }
 
-    /// [`Self::track_view`] where fields may be there already: see [`Tracker::track_missing`](super::Tracker::track_missing).
-    pub(super) fn track_missing<E: From<LearnedError>>(
+    /// [`Tracker::track_window`](super::Tracker::track_window).
+    pub(super) fn track_window<E: From<LearnedError> + From<StateMisfit>>(
         &self,
-        frame_count: usize,
+        from: TrackState,
+        frames: Range<usize>,
         is_wanted: &dyn Fn(usize) -> bool,
         load: &mut dyn FnMut(usize) -> Result<Arc<Image>, E>,
         settings: &TrackingSettings,
         emit: &mut dyn FnMut(usize, TrackField) -> Result<(), E>,
-    ) -> Result<(), E> {
+    ) -> Result<TrackState, E> {
         match self.signature() {
             Signature::PairFlow => {
-                let settings = self.chained(settings);
-                view::track_frames(frame_count, load, &settings, self, emit)
+                view::track_between(from, frames, load, &self.chained(settings), self, emit)
             }
             Signature::KeyToFrame => {
-                key_to_frame::track_view(self, frame_count, is_wanted, load, settings, emit)
+                key_to_frame::track(self, frames, is_wanted, load, settings, emit)?;
+                Ok(TrackState::default())
             }
         }
     }

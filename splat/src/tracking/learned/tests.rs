@@ -7,7 +7,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::{test_model::Net, *};
-use crate::tracking::Tracker;
+use crate::tracking::{Tracker, tests::Failed};
 
 /// Change of red per pixel along x, and of green per pixel along y.
 const SLOPE: f32 = 0.01;
@@ -156,14 +156,17 @@ fn fields_that_exist_cost_a_key_to_frame_network_nothing() {
         let (mut loaded, mut made) = (Vec::new(), Vec::new());
         let mut load = |index| {
             loaded.push(index);
-            Ok::<_, LearnedError>(image(index))
+            Ok::<_, Failed>(image(index))
         };
         let mut emit = |index, field| {
             made.push((index, field));
             Ok(())
         };
         let settings = TrackingSettings::default();
-        tracker.track_missing(6, &|index| wanted.contains(&index), &mut load, &settings, &mut emit).unwrap();
+        let is_wanted = |index: usize| wanted.contains(&index);
+        let window =
+            tracker.track_window(TrackState::default(), 1..6, &is_wanted, &mut load, &settings, &mut emit);
+        assert_eq!(window.unwrap(), TrackState::default());
         (loaded, made)
     };
     let (loaded, all) = missing(&[1, 2, 3, 4, 5]);
@@ -176,18 +179,32 @@ fn fields_that_exist_cost_a_key_to_frame_network_nothing() {
 }
 
 #[test]
-fn a_pair_network_tracks_up_to_the_last_missing_field() {
-    let net = pair_net(255.0 * SLOPE).bytes();
-    let tracker = Tracker::new(Some((net, "net.onnx")), &TrackingSettings::default()).unwrap();
-    let mut made = Vec::new();
-    let mut load = |t| Ok::<_, LearnedError>(frame((32, 24), [1.0, 0.5], 0.0, t));
-    let mut emit = |index, _| {
-        made.push(index);
+fn a_pair_network_goes_on_from_a_state_to_the_same_bytes() {
+    let tracker =
+        Tracker::new(Some((pair_net(255.0 * SLOPE).bytes(), "net.onnx")), &TrackingSettings::default());
+    let tracker = tracker.unwrap();
+    let settings = TrackingSettings::default();
+    let mut load = |t: usize| Ok::<_, Failed>(frame((32, 24), [1.0, 0.5], 0.0, t));
+    let mut whole = Vec::new();
+    let mut emit = |_, field| {
+        whole.push(field);
         Ok(())
     };
-    let settings = TrackingSettings::default();
-    tracker.track_missing(6, &|index| index == 3, &mut load, &settings, &mut emit).unwrap();
-    assert_eq!(made, [1, 2, 3]);
+    tracker.track_view(6, &mut load, &settings, &mut emit).unwrap();
+    for cuts in [&[1, 2, 3, 4, 5, 6][..], &[1, 3, 5, 6], &[1, 4, 6]] {
+        let mut fields = Vec::new();
+        let mut state = TrackState::default();
+        for window in cuts.windows(2) {
+            let mut emit = |_, field| {
+                fields.push(field);
+                Ok(())
+            };
+            let frames = window[0]..window[1];
+            state = tracker.track_window(state, frames, &|_| true, &mut load, &settings, &mut emit).unwrap();
+            assert!(state.indices().count() == 2.min(window[1] - 1));
+        }
+        assert_eq!(fields, whole, "{cuts:?}");
+    }
 }
 
 #[test]

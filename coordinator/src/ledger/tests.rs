@@ -1,0 +1,172 @@
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use trackersplat_proto::v1::FailureKind;
+
+use super::*;
+
+fn blob(name: &str) -> Blob {
+    Blob { digest: name.into(), size: 10 }
+}
+
+fn found(frame: u32, name: &str) -> TrackedField {
+    TrackedField { frame, tracks: Some(blob(name)) }
+}
+
+/// Views 0 and 2 over frames 3, 4, 6; the key frame is 3.
+fn ledger() -> TrackLedger {
+    let field = |frame: u32| Field {
+        frame,
+        image: blob(&format!("image-{frame}")),
+        key: format!("key-{frame}"),
+        tracks: None,
+    };
+    let view = |name: &str| TrackedView {
+        name: name.into(),
+        size: (8, 6),
+        key_image: blob("image-3"),
+        fields: vec![field(4), field(6)],
+        window: 16,
+        states: Vec::new(),
+    };
+    let tracker = Tracker { settings_json: "{}".into(), ..Tracker::default() };
+    let views = [(0, view("cam00")), (2, view("cam02"))].into();
+    TrackLedger::new("job".into(), 3, tracker, 2, views)
+}
+
+#[test]
+fn a_frame_is_tracked_once_every_view_is() {
+    let mut ledger = ledger();
+    assert_eq!(ledger.at(3), Some(BTreeMap::new()), "nothing moves to the key frame");
+    ledger.keep(0, &found(4, "a"));
+    assert_eq!((ledger.at(4), ledger.missing(0), ledger.missing(2)), (None, Some(6), Some(4)));
+    ledger.keep(2, &found(4, "b"));
+    assert_eq!(ledger.at(4), Some([(0, blob("a")), (2, blob("b"))].into()));
+    assert_eq!((ledger.at(6), ledger.at(5), ledger.counts()), (None, None, (2, 4)));
+    ledger.keep(0, &found(6, "c"));
+    assert_eq!((ledger.missing(0), ledger.positions()), (None, vec![0, 2]));
+}
+
+#[test]
+fn the_first_field_counts_and_another_one_is_a_defect() {
+    let mut ledger = ledger();
+    let place = Place { key: "key-4".into(), size: (8, 6) };
+    assert_eq!(ledger.place(0, &found(4, "a")), Ok(Some(place)));
+    ledger.keep(0, &found(4, "a"));
+    assert_eq!(ledger.place(0, &found(4, "a")), Ok(None));
+    let message = ledger.place(0, &found(4, "other")).unwrap_err();
+    assert!(message.contains("cam00") && message.contains("frame 4"), "{message}");
+    ledger.keep(0, &found(4, "other"));
+    assert_eq!(ledger.lease(0).unwrap().frames[1].tracks, Some(blob("a")));
+    for (position, frame) in [(0, 3), (0, 5), (1, 4)] {
+        assert!(ledger.place(position, &found(frame, "a")).is_err(), "{position} {frame}");
+    }
+    assert!(ledger.place(0, &TrackedField { frame: 6, tracks: None }).is_err());
+}
+
+#[test]
+fn a_field_of_another_job_counts_and_a_different_one_is_left_aside() {
+    let mut ledger = ledger();
+    ledger.adopt(0, 4, blob("theirs"));
+    assert_eq!(
+        (ledger.lease(0).unwrap().frames[1].tracks.clone(), ledger.counts()),
+        (Some(blob("theirs")), (1, 4))
+    );
+    assert_eq!(ledger.place(0, &found(4, "own")), Ok(None));
+}
+
+#[test]
+fn a_task_names_what_exists_and_a_failure_its_view() {
+    let mut ledger = ledger();
+    ledger.keep(2, &found(6, "c"));
+    let task = ledger.lease(2).unwrap();
+    let frames: Vec<_> = task.frames.iter().map(|frame| (frame.frame, frame.tracks.is_some())).collect();
+    assert_eq!(frames, [(3, false), (4, false)], "nobody needs frame 6 again");
+    assert_eq!((task.view.as_str(), ledger.lease(1)), ("cam02", None));
+    ledger.fail(2, &failure(FailureKind::BadInput, "frame 4 is no image"));
+    ledger.fail(0, &failure(FailureKind::Bug, "later"));
+    assert_eq!(ledger.failed().unwrap().message, "tracks of view 'cam02': frame 4 is no image");
+}
+
+/// One view over frames 10, 11, … 16 in windows of two; the key frame is 10.
+fn in_windows(reach: usize) -> TrackLedger {
+    let field = |frame: u32| Field {
+        frame,
+        image: blob(&format!("image-{frame}")),
+        key: format!("key-{frame}"),
+        tracks: None,
+    };
+    let view = TrackedView {
+        name: "cam00".into(),
+        size: (8, 6),
+        key_image: blob("image-10"),
+        fields: (11..=16).map(field).collect(),
+        window: 2,
+        states: (0..2).map(|number| State { key: format!("state-{number}"), blob: None }).collect(),
+    };
+    TrackLedger::new("job".into(), 10, Tracker::default(), reach, [(0, view)].into())
+}
+
+fn numbers(frames: &[TrackFrame]) -> Vec<u32> {
+    frames.iter().map(|frame| frame.frame).collect()
+}
+
+fn keep_leased(ledger: &mut TrackLedger, job: &TrackJob, state: Option<&str>) {
+    for frame in &job.frames[1..] {
+        ledger.keep(0, &found(frame.frame, "field"));
+    }
+    if let Some(state) = state {
+        ledger.keep_state(0, &blob(state));
+    }
+}
+
+#[test]
+fn windows_follow_each_other_by_their_states() {
+    let mut ledger = in_windows(3);
+    assert_eq!(ledger.before(0), 0);
+    let first = ledger.lease(0).unwrap();
+    assert_eq!((numbers(&first.frames), first.first, first.past.len()), (vec![10, 11, 12], 1, 0));
+    assert_eq!((&first.state, first.wants_state), (&None, true));
+    assert_eq!(ledger.lacks(0).unwrap(), "the tracks to frame 11");
+    keep_leased(&mut ledger, &first, None);
+    assert!(ledger.lacks(0).unwrap().contains("state"));
+    assert_eq!(ledger.state_place(0), Some(StatePlace { key: "state-0".into(), past: 1..3 }));
+    keep_leased(&mut ledger, &first, Some("a"));
+    assert_eq!((ledger.lacks(0), ledger.state_place(0), ledger.before(0)), (None, None, 11));
+
+    let second = ledger.lease(0).unwrap();
+    assert_eq!((numbers(&second.frames), numbers(&second.past)), (vec![10, 13, 14], vec![11, 12]));
+    assert_eq!((second.first, second.state.clone(), second.wants_state), (3, Some(blob("a")), true));
+    assert_eq!(ledger.state_place(0).unwrap().past, 2..5);
+    assert_eq!(ledger.take_superseded(0), [], "it is begun from");
+    keep_leased(&mut ledger, &second, Some("b"));
+    let superseded = ledger.take_superseded(0);
+    assert_eq!(superseded, [State { key: "state-0".into(), blob: Some(blob("a")) }]);
+
+    let last = ledger.lease(0).unwrap();
+    assert_eq!((numbers(&last.frames), numbers(&last.past)), (vec![10, 15, 16], vec![12, 13, 14]));
+    assert_eq!((last.state.clone(), last.wants_state, ledger.before(0)), (Some(blob("b")), false, 13));
+    keep_leased(&mut ledger, &last, None);
+    assert_eq!((ledger.lacks(0), ledger.missing(0), ledger.lease(0)), (None, None, None));
+    assert_eq!(ledger.take_superseded(0).len(), 1);
+}
+
+#[test]
+fn a_state_that_is_gone_costs_the_windows_before_it() {
+    let mut ledger = in_windows(1);
+    for state in ["a", "b"] {
+        let job = ledger.lease(0).unwrap();
+        keep_leased(&mut ledger, &job, Some(state));
+    }
+    assert_eq!(ledger.next_state(0).unwrap().key, "state-1");
+    ledger.lose_state(0, "state-1");
+    let again = ledger.lease(0).unwrap();
+    assert_eq!((again.first, again.state.clone(), again.wants_state), (3, Some(blob("a")), true));
+    assert!(again.frames[1..].iter().all(|frame| frame.tracks.is_some()), "only the state is missing");
+    assert_eq!(ledger.leased_state(0).unwrap().key, "state-0");
+    ledger.lose_state(0, "state-0");
+    assert_eq!(ledger.lease(0).unwrap().first, 1);
+    assert_eq!(ledger.leased_state(0), None);
+    ledger.keep_state(0, &blob("a"));
+    let again = ledger.lease(0).unwrap();
+    assert_eq!((again.first, again.wants_state), (3, true));
+}

@@ -1,0 +1,296 @@
+#![allow(clippy::unwrap_used, reason = "tests")]
+//! Views that are tracked window by window, by workers and by the coordinator.
+
+use std::sync::Arc;
+
+use splat::{
+    formats::{track_blob, track_state},
+    image::Image,
+    tracking::{TrackState, Tracker, TrackingSettings},
+};
+use trackersplat_proto::v1::{
+    Blob, FailureKind, FieldReport, JobState, Lease, SubmitRequest, Tracked, TrackedField, job_event::Event,
+    lease, report::Outcome, worker_message,
+};
+
+use super::{harness::*, tracks::shifted};
+use crate::{
+    failure::StageError,
+    queue::{Task, TaskKey},
+};
+
+/// A clip of seven frames, in windows of two: the third window has two frames as well.
+async fn bench() -> Bench {
+    let bench = Bench::start().await;
+    write_clip_of(7, &bench.folder.path().join("clip"), 0);
+    bench
+}
+
+fn request(bench: &Bench, window: u32) -> SubmitRequest {
+    SubmitRequest { settings_json: format!(r#"{{"tracking": {{"window": {window}}}}}"#), ..bench.request() }
+}
+
+/// A state that remembers one frame, another one for every view.
+fn state_of(view: &str, place: usize) -> Vec<u8> {
+    let motion = view.bytes().map(f32::from).sum::<f32>() * 0.01;
+    let image = |place: usize| {
+        let mut image = Image::filled(24, 16, [0.0; 3]);
+        for (index, pixel) in image.pixels.chunks_exact_mut(3).enumerate() {
+            let (x, y) = ((index % 24) as f32 - motion * place as f32, (index / 24) as f32);
+            pixel.fill(0.5 + 0.25 * (x * 0.9).sin() + 0.25 * (y * 0.7).cos());
+        }
+        Arc::new(image)
+    };
+    let mut load = |place| Ok::<_, StageError>(image(place));
+    let settings = TrackingSettings::default();
+    let (nothing, window) = (TrackState::default(), place..place + 1);
+    let tracked =
+        Tracker::BuiltIn.track_window(nothing, window, &|_| true, &mut load, &settings, &mut |_, _| Ok(()));
+    track_state::encode(&tracked.ok().unwrap())
+}
+
+async fn field(bench: &Bench, frame: u32) -> TrackedField {
+    let encoded = track_blob::encode(&shifted(8, frame as f32));
+    TrackedField { frame, tracks: Some(bench.put(encoded).await) }
+}
+
+/// What an honest worker reports of a window.
+async fn window(bench: &Bench, lease: &Lease) -> Tracked {
+    let job = track_job(lease);
+    let mut fields = Vec::new();
+    for frame in job.frames[1..].iter().filter(|frame| frame.tracks.is_none()) {
+        fields.push(field(bench, frame.frame).await);
+    }
+    let state = match job.wants_state {
+        true => Some(bench.put(state_of(&job.view, job.window().end - 1)).await),
+        false => None,
+    };
+    Tracked { fields, state }
+}
+
+/// Name of the view, numbers of the window's frames.
+fn leased(lease: &Lease) -> (String, Vec<u32>) {
+    let job = track_job(lease);
+    (job.view, job.frames[1..].iter().map(|frame| frame.frame).collect())
+}
+
+impl Worker {
+    /// Does a task honestly.
+    async fn finish(&mut self, bench: &Bench, lease: &Lease) {
+        let outcome = match &lease.task {
+            Some(lease::Task::Tracks(_)) => Outcome::Tracked(window(bench, lease).await),
+            _ => Outcome::Success(bench.result(lease).await),
+        };
+        let receipt = self.report(lease, outcome).await;
+        assert!(receipt.accepted, "{receipt:?}");
+    }
+
+    /// The next window, once the frames before it are done.
+    async fn window(&mut self, bench: &Bench) -> Lease {
+        loop {
+            let lease = self.lease().await;
+            if let Some(lease::Task::Tracks(_)) = lease.task {
+                return lease;
+            }
+            self.finish(bench, &lease).await;
+        }
+    }
+
+    /// Does everything until the job ends; the windows that it was given.
+    async fn finish_job(&mut self, bench: &Bench, job: &str) -> Vec<(String, Vec<u32>)> {
+        let mut windows = Vec::new();
+        loop {
+            tokio::select! {
+                (state, failure) = bench.ended(job) => {
+                    assert_eq!(state, JobState::Done, "{failure:?}");
+                    return windows;
+                }
+                lease = self.lease() => {
+                    if let Some(lease::Task::Tracks(_)) = lease.task {
+                        windows.push(leased(&lease));
+                    }
+                    self.finish(bench, &lease).await;
+                }
+            }
+        }
+    }
+}
+
+/// A worker, and a job of which it has done the first windows of all views.
+async fn after_first_windows(bench: &Bench) -> (Worker, String) {
+    let mut worker = bench.worker("w").await;
+    let job = bench.submit(request(bench, 2)).await.unwrap().job_id;
+    for view in ["cam00", "cam01", "cam02"] {
+        let lease = worker.window(bench).await;
+        assert_eq!(leased(&lease), (view.into(), vec![2, 3]));
+        worker.finish(bench, &lease).await;
+    }
+    (worker, job)
+}
+
+#[tokio::test]
+async fn views_take_turns_and_frames_are_done_while_later_windows_wait() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let mut watch = bench.watch(&job, 0).await;
+    let mut order = Vec::new();
+    for published in [3, 3, 3, 3, 5, 5, 5, 5, 5, 7, 7, 7, 7] {
+        watch_frame(&mut watch, published, &order).await;
+        let lease = worker.lease().await;
+        order.push(match &lease.task {
+            Some(lease::Task::Tracks(_)) => format!("{:?}", leased(&lease)),
+            _ => frame_job(&lease).frame.to_string(),
+        });
+        worker.finish(&bench, &lease).await;
+    }
+    let expected = [
+        "1",
+        r#"("cam00", [4, 5])"#,
+        r#"("cam01", [4, 5])"#,
+        r#"("cam02", [4, 5])"#,
+        "2",
+        "3",
+        r#"("cam00", [6, 7])"#,
+        r#"("cam01", [6, 7])"#,
+        r#"("cam02", [6, 7])"#,
+        "4",
+        "5",
+        "6",
+        "7",
+    ];
+    assert_eq!(order, expected);
+    assert_eq!(bench.ended(&job).await.0, JobState::Done);
+    for (view, place) in [("cam00", 2), ("cam00", 4), ("cam02", 4)] {
+        let state = crate::blobs::name(&state_of(view, place));
+        assert!(!bench.hub().blobs.holds(&state).await, "nobody goes on from {view} after {place}");
+    }
+}
+
+/// Waits until a frame is published, unless it was waited for before.
+async fn watch_frame(watch: &mut Watch, frame: u32, order: &[String]) {
+    if matches!((frame, order.len()), (3, 0) | (5, 4) | (7, 9)) {
+        watch.until(|event| matches!(event, Event::FrameState(f) if f.frame == frame)).await;
+    }
+}
+
+#[tokio::test]
+async fn a_worker_that_dies_in_a_window_costs_the_window() {
+    let bench = bench().await;
+    let (mut lost, job) = after_first_windows(&bench).await;
+    let mut heir = bench.worker("heir").await;
+    let lease = lost.window(&bench).await;
+    assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
+    let stored = field(&bench, 4).await;
+    let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
+    let report = FieldReport { lease_id, attempt, field: Some(stored.clone()) };
+    lost.send(worker_message::Message::Field(report)).await;
+    let counted = |event: &Event| matches!(event, Event::Progress(p) if p.stage == "tracking" && p.done == 7);
+    bench.watch(&job, 0).await.until(counted).await;
+    drop(lost);
+    let is_lost = |event: &Event| matches!(event, Event::TracksState(t) if t.failure.is_some());
+    bench.watch(&job, 0).await.until(is_lost).await;
+
+    let again = heir.window(&bench).await;
+    let request = track_job(&again);
+    assert_eq!((leased(&again), again.attempt), (("cam00".into(), vec![4, 5]), 3));
+    assert_eq!(request.state, Some(crate::blobs::name(&state_of("cam00", 2))));
+    assert_eq!((request.first, request.past.iter().map(|frame| frame.frame).collect()), (3, vec![2, 3]));
+    let exists: Vec<Option<Blob>> = request.frames.into_iter().map(|frame| frame.tracks).collect();
+    assert_eq!(exists, [None, stored.tracks, None]);
+    heir.finish(&bench, &again).await;
+    let rest = heir.finish_job(&bench, &job).await;
+    assert_eq!(rest.len(), 5, "{rest:?}");
+}
+
+#[tokio::test]
+async fn a_restarted_coordinator_goes_on_at_the_end_of_the_last_window() {
+    let mut bench = bench().await;
+    let (_, job) = after_first_windows(&bench).await;
+    bench.stop().await;
+    bench.restart().await;
+    let mut worker = bench.worker("w").await;
+    let windows = worker.finish_job(&bench, &job).await;
+    let numbers: Vec<&[u32]> = windows.iter().map(|window| window.1.as_slice()).collect();
+    assert_eq!(numbers, [[4, 5], [4, 5], [4, 5], [6, 7], [6, 7], [6, 7]]);
+}
+
+#[tokio::test]
+async fn a_state_that_is_gone_or_damaged_costs_the_window_before_it_and_no_attempt() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let file = |view: &str| {
+        let digest = crate::blobs::name(&state_of(view, 2)).digest;
+        bench.options.root.join("blobs").join(&digest[..2]).join(&digest)
+    };
+    std::fs::remove_file(file("cam00")).unwrap();
+    let lease = worker.window(&bench).await;
+    let request = track_job(&lease);
+    assert_eq!((leased(&lease), request.first), (("cam00".into(), vec![2, 3]), 1));
+    assert!(request.wants_state && request.frames[1..].iter().all(|frame| frame.tracks.is_some()));
+    worker.finish(&bench, &lease).await;
+    let lease = worker.window(&bench).await;
+    assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
+    worker.finish(&bench, &lease).await;
+
+    let size = std::fs::metadata(file("cam01")).unwrap().len();
+    std::fs::write(file("cam01"), vec![7; size as usize]).unwrap();
+    let lease = worker.window(&bench).await;
+    assert_eq!(leased(&lease), ("cam01".into(), vec![4, 5]));
+    assert!(worker.fail(&lease, FailureKind::Transient).await.accepted);
+    let lease = worker.window(&bench).await;
+    assert_eq!((leased(&lease), lease.attempt), (("cam01".into(), vec![2, 3]), 3));
+    let key = TaskKey { job: job.as_str().into(), task: Task::Tracks(1) };
+    assert_eq!(bench.hub().store.task(&key).await.unwrap().unwrap().failures, 0);
+    worker.finish(&bench, &lease).await;
+    let rest = worker.finish_job(&bench, &job).await;
+    assert_eq!(rest.len(), 5, "{rest:?}");
+}
+
+#[tokio::test]
+async fn a_window_needs_its_state_and_one_of_its_own_frames() {
+    let bench = bench().await;
+    let mut worker = bench.worker("w").await;
+    let job = bench.submit(request(&bench, 2)).await.unwrap().job_id;
+    let states = [
+        (None, "lacks the tracker's state"),
+        (Some(bench.put(b"no state".to_vec()).await), "not a TSSTATE blob"),
+    ];
+    for (state, said) in states {
+        let lease = worker.window(&bench).await;
+        let tracked = Tracked { state, ..window(&bench, &lease).await };
+        let receipt = worker.report(&lease, Outcome::Tracked(tracked)).await;
+        assert!(!receipt.accepted && receipt.reason.contains(said), "{receipt:?}");
+    }
+    let lease = worker.window(&bench).await;
+    let state = Some(bench.put(state_of("cam00", 3)).await);
+    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields: vec![], state })).await;
+    assert!(!receipt.accepted, "{receipt:?}");
+    assert!(receipt.reason.contains("remembers the view's frame 3, frames 1 to 2"), "{}", receipt.reason);
+    let (state, failure) = bench.ended(&job).await;
+    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Bug));
+}
+
+#[tokio::test]
+async fn the_coordinator_alone_tracks_in_windows_to_the_same_bytes() {
+    let mut found = Vec::new();
+    for window in [1, 2, 16] {
+        let bench = bench().await;
+        let job = bench.submit(request(&bench, window)).await.unwrap().job_id;
+        let tracked = |event: &Event| matches!(event, Event::JobState(j) if j.state() == JobState::Frames);
+        bench.watch(&job, 0).await.until(tracked).await;
+        let all =
+            |ledger: &crate::ledger::TrackLedger| (2..=7).map(|frame| ledger.at(frame)).collect::<Vec<_>>();
+        found.push(bench.hub().tracks(&job.as_str().into(), all).await.unwrap());
+        assert!(found.iter().all(|fields| *fields == found[0] && fields.iter().all(Option::is_some)));
+
+        let again = SubmitRequest { output: bench.path("again"), ..request(&bench, 3) };
+        let other = bench.submit(again).await.unwrap().job_id;
+        let mut watch = bench.watch(&other, 0).await;
+        watch
+            .until(|event| {
+                assert!(!matches!(event, Event::TracksState(_)), "another cut has the same fields");
+                tracked(event)
+            })
+            .await;
+    }
+}
