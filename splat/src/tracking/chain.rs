@@ -37,7 +37,7 @@ pub(super) fn chain(to_earlier: &Judged, onward: &Judged) -> Judged {
 }
 
 /// Share of the distance to the nearest candidate that disagrees in the standard deviation.
-const DOUBT: f32 = 0.116;
+const DOUBT: f32 = 0.164;
 /// Candidates closer than this support each other, pixels.
 const AGREE: f32 = 2.0;
 

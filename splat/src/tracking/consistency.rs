@@ -30,16 +30,16 @@ impl Judged {
         Self { flow, visible, sigma, links: vec![1.0; pixels], alignment: vec![0.0; pixels] }
     }
 
-    /// The standard deviation per axis to state for each pixel, pixels.
-    pub(super) fn stated_sigma(&self, floor: f32) -> Vec<f32> {
-        let stated = |(i, contrast): (usize, f32)| {
+    /// The standard deviation of each pixel's track per axis, pixels; without the floor.
+    pub(super) fn deviations(&self) -> Vec<f32> {
+        let deviation = |(i, contrast): (usize, f32)| {
             let squared = self.flow.u[i] * self.flow.u[i] + self.flow.v[i] * self.flow.v[i];
             let interpolation = INTERPOLATION * squared / (squared + INTERPOLATED * INTERPOLATED);
-            let boundary = BOUNDARY * contrast.min(WIDEST_CONTRAST);
-            let matches = self.sigma[i] * self.sigma[i] + self.alignment[i];
-            (floor * floor + interpolation + boundary + matches).sqrt()
+            let beyond_noise = contrast / (contrast + NOISY_CONTRAST);
+            let boundary = BOUNDARY * contrast.min(WIDEST_CONTRAST) * beyond_noise;
+            (interpolation + boundary + self.sigma[i] * self.sigma[i] + self.alignment[i]).sqrt()
         };
-        self.flow.contrast().into_iter().enumerate().map(stated).collect()
+        self.flow.contrast().into_iter().enumerate().map(deviation).collect()
     }
 }
 
@@ -51,33 +51,35 @@ const NOISE: f32 = 6.0;
 const COLOUR_TOLERANCE: f32 = 24.0;
 
 // The variance of a track per axis is modelled as
-//     floor² + m INTERPOLATION + BOUNDARY c + Σ r (TRIP e² + NOISE_SHARE n/λ) + DOUBT² d² + r ALIGNMENT L a²,
+//     floor² + m INTERPOLATION + BOUNDARY c' + Σ r (TRIP e² + NOISE_SHARE n/λ) + DOUBT² d² + r ALIGNMENT L a²,
 // with sums over the matches of its chain: e is the forward-backward error, n the mean squared residual of the window,
 // λ the smaller eigenvalue of the structure tensor; d is the distance to a candidate that disagrees (`chain`), a how far
-// the alignment with the key frame moves the track, L the number of matches; c is how much neighbouring displacements
-// differ; r < 1 where the flow is smooth as it rests, m from 0 at rest to 1.
+// the alignment with the key frame moves the track, L the number of matches; c' is how much neighbouring displacements
+// differ, less where noise explains it; r < 1 where the flow is smooth as it rests, m from 0 at rest to 1.
 // Fitted by the shares of errors within one and two standard deviations, by decile, and the pinball loss of both, on three
 // clips; docs/tracking.md has the procedure and the result.
 
 /// Share of a match's squared forward-backward error.
-const TRIP: f32 = 0.0177;
+const TRIP: f32 = 0.0354;
 /// Share of the variance by image noise: neighbouring residuals are not independent, yet most noise averages out.
-const NOISE_SHARE: f32 = 0.00336;
+const NOISE_SHARE: f32 = 0.0067;
 /// Least eigenvalue that counts as texture.
 const LEAST_TEXTURE: f32 = 1e-4;
 /// Power of the smoothness by which the variance of what rests is divided: neighbours share their noise.
 const REST_POWER: f32 = 0.65;
 /// Variance of what moves, as it is found between pixels, square pixels.
-const INTERPOLATION: f32 = 0.02 * 0.02;
+const INTERPOLATION: f32 = 0.012 * 0.012;
 /// Displacement of which half counts as such, pixels: far more than noise makes of what rests.
 const INTERPOLATED: f32 = 0.5;
 /// Variance per pixel by which neighbouring displacements differ: some of them belong to the other side of the boundary, of
 /// a wide one a smaller part.
-const BOUNDARY: f32 = 0.024;
+const BOUNDARY: f32 = 0.029;
 /// Difference from which on it says no more, pixels.
-const WIDEST_CONTRAST: f32 = 5.0;
+const WIDEST_CONTRAST: f32 = 10.0;
+/// Difference of which half counts: what noise makes of neighbours that rest.
+const NOISY_CONTRAST: f32 = 0.0055;
 /// Share of the squared distance that the alignment moves a track.
-const ALIGNMENT: f32 = 1.2;
+const ALIGNMENT: f32 = 1.0;
 
 /// Agreement of the surroundings of each pixel with where a flow puts them.
 pub(super) struct Agreement {

@@ -67,8 +67,7 @@ pub struct TrackingSettings {
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
     #[serde(deserialize_with = "range::correlation")]
     pub correlation: f32,
-    /// Standard deviation that no track goes below, pixels; above 0, default 0.008; of the resolution that is matched, so
-    /// that the images' pixels are as often more as they were halved.
+    /// Standard deviation that no track goes below, pixels; above 0, default 0.008.
     #[serde(deserialize_with = "range::distance")]
     pub sigma_floor: f32,
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.

@@ -320,7 +320,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         let (width, height) = (self.width as usize, self.height as usize);
         let flow = &tracks.flow;
         let scale = Flow::reduction([width, height], [flow.width, flow.height]);
-        let stated = tracks.stated_sigma(self.settings.sigma_floor);
+        let deviations = tracks.deviations();
         let mut field = TrackField {
             width: self.width,
             height: self.height,
@@ -334,9 +334,11 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
                 let corners = flow.corners(fx, fy);
                 let [u, v] = flow.between(&corners);
                 let visible = flow::sees(&corners, &tracks.visible);
-                let sigma: f32 = corners.iter().map(|&(corner, weight)| weight * stated[corner]).sum();
+                let deviation: f32 =
+                    corners.iter().map(|&(corner, weight)| weight * deviations[corner]).sum();
                 let position = [x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale];
-                let sigma = sigma * scale + if visible { 0.0 } else { self.settings.hidden_sigma };
+                let stated = (deviation * scale).hypot(self.settings.sigma_floor);
+                let sigma = stated + if visible { 0.0 } else { self.settings.hidden_sigma };
                 if position[0].is_finite() && position[1].is_finite() && sigma.is_finite() && sigma > 0.0 {
                     field.positions.push(position);
                     field.visible.push(visible);
