@@ -156,13 +156,14 @@ fn observed_fit(
     camera.contains(fit.target).then_some(fit)
 }
 
-/// Drops views that hardly see the Gaussian and trusts the others by how well they see it, relative to the view that sees
-/// it most clearly in the key frame, be it hidden there at the target: a pixel in front of a hidden Gaussian tracks its
-/// occluder.
+/// Drops views that hardly see the Gaussian, relative to the view that sees it most clearly in the key frame, be it hidden
+/// there at the target: a pixel in front of a hidden Gaussian tracks its occluder. Trusts the others by how well they see
+/// it, relative to the best of them.
 fn trust_unoccluded(observations: &mut Vec<Observation>, clearest: f64, settings: &MotionSettings) {
     observations
         .retain(|o| o.transmittance >= settings.min_relative_transmittance * clearest && clearest > 0.0);
+    let best = observations.iter().map(|o| o.transmittance).fold(0.0, f64::max);
     for observation in observations {
-        observation.fit.variance *= clearest / observation.transmittance;
+        observation.fit.variance *= best / observation.transmittance;
     }
 }

@@ -3,9 +3,10 @@
 use super::{
     TrackingSettings,
     flow::Flow,
+    matcher::Noise,
     pair::Frame,
     planes::{PATCH, Planes},
-    refine::rest,
+    refine::{SHADING_RADIUS, rest},
     windows::{box_counts, box_sum},
 };
 
@@ -63,6 +64,9 @@ const COLOUR_TOLERANCE: f32 = 24.0;
 const TRIP: f32 = 0.0354;
 /// Share of the variance by image noise: neighbouring residuals are not independent, yet most noise averages out.
 const NOISE_SHARE: f32 = 0.0067;
+/// How much more of both where the noise is unknown: the shares are fitted beside the term of boundaries, which says less
+/// of flow that errs elsewhere.
+const CAUTION: f32 = 5.0;
 /// Least eigenvalue that counts as texture.
 const LEAST_TEXTURE: f32 = 1e-4;
 /// Power of the smoothness by which the variance of what rests is divided: neighbours share their noise.
@@ -145,10 +149,12 @@ fn fetched(image: &Planes, flow: &Flow) -> [Vec<f32>; 3] {
     channels
 }
 
-/// Smaller eigenvalue of the structure tensor around each pixel, summed over channels and a window of about a patch.
+/// Smaller eigenvalue of the structure tensor around each pixel, summed over channels and a window of about a patch. Of the
+/// gradients without their mean, as matching counts no others: a ramp tells no displacement that shading would not explain.
 pub(super) fn texture(colours: &Planes) -> Vec<f32> {
     let (width, height) = (colours.width, colours.height);
-    let [gx, gy] = colours.gradients().map(|planes| planes.interiors());
+    let unshaded = Planes::from_interiors(width, height, colours.high_passed(SHADING_RADIUS));
+    let [gx, gy] = unshaded.gradients().map(|planes| planes.interiors());
     let tensor = |a: &[Vec<f32>; 3], b: &[Vec<f32>; 3]| {
         let products: Vec<f32> =
             (0..width * height).map(|i| a[0][i] * b[0][i] + a[1][i] * b[1][i] + a[2][i] * b[2][i]).collect();
@@ -175,14 +181,13 @@ fn round_trip(flow: &Flow, back: &Flow) -> Vec<f32> {
     error
 }
 
-/// Judges the flow from `first` to `second` by the flow back and by what both frames show; `smooths_rest` says whether
-/// neighbours that rest share their noise.
+/// Judges the flow from `first` to `second` by the flow back and by what both frames show.
 pub(super) fn judge(
     first: &Frame,
     second: &Frame,
     flow: Flow,
     back: &Flow,
-    smooths_rest: bool,
+    noise: Noise,
     settings: &TrackingSettings,
 ) -> Judged {
     let error = round_trip(&flow, back);
@@ -196,12 +201,15 @@ pub(super) fn judge(
             let inside = is_inside(x as f32 + u, y as f32 + v, flow.width, flow.height);
             visible
                 .push(inside && error[i] < settings.consistency && agreement.holds(i, settings.correlation));
-            let noise = agreement.residual[i].max(4.0);
+            let residual = agreement.residual[i].max(4.0);
             let squared_error = error[i] * error[i];
-            let variance = TRIP * squared_error + NOISE_SHARE * noise / (first.texture[i] + LEAST_TEXTURE);
+            let variance = TRIP * squared_error + NOISE_SHARE * residual / (first.texture[i] + LEAST_TEXTURE);
             // What nothing is known of rests for no reason.
             let rests = (u * u + v * v).max(squared_error).max(variance);
-            let variance = if smooths_rest { variance * share_at_rest(rests) } else { variance };
+            let variance = match noise {
+                Noise::SharedAtRest => variance * share_at_rest(rests),
+                Noise::Unknown(least) => least * least + CAUTION * variance,
+            };
             sigma.push(variance.sqrt().min(flow.width.max(flow.height) as f32));
         }
     }
@@ -234,5 +242,57 @@ pub(super) fn account_for_alignment(aligned: &mut Judged, before: &Flow) {
         let squared = moved[0] * moved[0] + moved[1] * moved[1];
         let displaced = aligned.flow.u[i] * aligned.flow.u[i] + aligned.flow.v[i] * aligned.flow.v[i];
         aligned.alignment[i] = ALIGNMENT * aligned.links[i] * squared * share_at_rest(displaced.max(squared));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The middle pixel of 3x3 that all move by `u`, their upper row by `step` more.
+    fn middle(u: f32, step: f32, sigma: f32, alignment: f32) -> f32 {
+        let mut flow = Flow::zeros(3, 3);
+        flow.u.fill(u);
+        flow.u[..3].fill(u + step);
+        let mut judged = Judged::of(flow, vec![true; 9], vec![sigma; 9]);
+        judged.alignment.fill(alignment);
+        judged.deviations()[4]
+    }
+
+    #[test]
+    fn deviations_are_the_sum_of_their_terms() {
+        // Against the formula in double precision; f32 rounds a sum of squares by some 1e-7 of it.
+        let exact = |u: f64, contrast: f64, sigma: f64, alignment: f64| {
+            let moves = 0.012f64.powi(2) * u * u / (u * u + 0.25);
+            let boundary = 0.029 * contrast.min(10.0) * contrast / (contrast + 0.0055);
+            (moves + boundary + sigma * sigma + alignment).sqrt()
+        };
+        for (u, step, sigma, alignment) in [
+            (0.0f32, 0.0f32, 0.01f32, 0.0f32),
+            (20.0, 0.0, 0.0, 0.0),
+            (0.5, 0.0, 0.02, 1e-4),
+            (0.0, 0.002, 0.0, 0.0),
+            (3.0, 1.5, 0.3, 0.04),
+            (0.0, -250.0, 0.0, 0.0),
+        ] {
+            let (found, exact) = (
+                f64::from(middle(u, step, sigma, alignment)),
+                exact(u.into(), f64::from(step.abs()), sigma.into(), alignment.into()),
+            );
+            assert!((found - exact).abs() < 1e-5 * exact, "{u} {step} {sigma} {alignment}: {found} {exact}");
+        }
+        assert_eq!(middle(0.0, 0.0, 0.0, 0.0), 0.0);
+    }
+
+    #[test]
+    fn a_ramp_of_brightness_is_no_texture() {
+        let channel =
+            |x: f32, y: f32| (0..40 * 30).map(|i| x * (i % 40) as f32 + y * (i / 40) as f32).collect();
+        let ramps = Planes::from_interiors(40, 30, [channel(2.5, 0.0), channel(0.0, 2.5), channel(1.0, 1.0)]);
+        let texture = texture(&ramps);
+        // Away from the edge, where windows see less than the whole.
+        let inner = (0..40 * 30).filter(|i| (9..31).contains(&(i % 40)) && (9..21).contains(&(i / 40)));
+        // Sums of 81 values up to 172 round by 1e-3 of a level, which counts squared.
+        assert!(inner.map(|i| texture[i]).fold(0.0, f32::max) < 1e-3);
     }
 }

@@ -61,7 +61,7 @@ impl Flow {
     /// How much the displacements of each pixel and its eight neighbours differ: length of their ranges along both axes.
     pub(super) fn contrast(&self) -> Vec<f32> {
         let (along_x, along_y) = (ranges(&self.u, self.width), ranges(&self.v, self.width));
-        along_x.iter().zip(&along_y).map(|(x, y)| x.hypot(*y)).collect()
+        along_x.iter().zip(&along_y).map(|(x, y)| (x * x + y * y).sqrt()).collect()
     }
 
     /// Resolution of an image over that of a field that was found on it after halvings, each of which rounds up: a power

@@ -15,13 +15,23 @@ pub(super) struct Ways {
     pub(super) backward: Flow,
 }
 
+/// How the matches of a matcher err.
+#[derive(Clone, Copy)]
+pub(super) enum Noise {
+    /// As the model of standard deviations is fitted to it: neighbours that rest share their noise, as the flow is smoothed
+    /// there.
+    SharedAtRest,
+    /// Nobody has measured it: by at least this standard deviation per axis, pixels, and by more than the model says.
+    Unknown(f32),
+}
+
 /// Finds the flow between two frames of the same size.
 pub(super) trait PairMatcher: Sync {
     /// Why it may fail.
     type Error;
 
-    /// Whether neighbours that rest share their noise, as the flow is smoothed there.
-    const SMOOTHS_REST: bool;
+    /// How far its matches err where nothing speaks against them.
+    const NOISE: Noise;
 
     /// The flow both ways; `guides` is what is known beforehand.
     fn both_ways(
@@ -42,7 +52,7 @@ pub(super) struct PatchSearch;
 impl PairMatcher for PatchSearch {
     type Error = Infallible;
 
-    const SMOOTHS_REST: bool = true;
+    const NOISE: Noise = Noise::SharedAtRest;
 
     fn both_ways(
         &self,

@@ -286,8 +286,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
         let continue_from = |past: &Past| {
             let Ways { forward, backward } =
                 self.matcher.both_ways(&past.frame, frame, None, self.settings)?;
-            let onward =
-                consistency::judge(&past.frame, frame, forward, &backward, M::SMOOTHS_REST, self.settings);
+            let onward = consistency::judge(&past.frame, frame, forward, &backward, M::NOISE, self.settings);
             let mut chained = chain::chain(&past.tracks, &onward);
             consistency::recheck(&self.key, frame, &mut chained, self.settings);
             Ok(chained)
@@ -303,7 +302,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
             _ => None,
         };
         let Ways { forward, backward } = self.matcher.both_ways(&self.key, frame, guides, self.settings)?;
-        Ok(consistency::judge(&self.key, frame, forward, &backward, M::SMOOTHS_REST, self.settings))
+        Ok(consistency::judge(&self.key, frame, forward, &backward, M::NOISE, self.settings))
     }
 
     /// The tracks, refined once more against the key frame itself.
@@ -337,7 +336,8 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
                 let deviation: f32 =
                     corners.iter().map(|&(corner, weight)| weight * deviations[corner]).sum();
                 let position = [x as f32 + 0.5 + u * scale, y as f32 + 0.5 + v * scale];
-                let stated = (deviation * scale).hypot(self.settings.sigma_floor);
+                let (found, floor) = (deviation * scale, self.settings.sigma_floor);
+                let stated = (found * found + floor * floor).sqrt();
                 let sigma = stated + if visible { 0.0 } else { self.settings.hidden_sigma };
                 if position[0].is_finite() && position[1].is_finite() && sigma.is_finite() && sigma > 0.0 {
                     field.positions.push(position);

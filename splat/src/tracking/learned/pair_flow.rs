@@ -8,20 +8,20 @@ use crate::tracking::{
     TrackingSettings,
     consistency::Judged,
     flow::Flow,
-    matcher::{PairMatcher, Ways},
+    matcher::{Noise, PairMatcher, Ways},
     pair::{Frame, Guides},
 };
 
 /// Displacement that leads out of any image, in its longer sides: what stands where the network says nothing.
 pub(super) const OUTSIDE: f32 = 2.0;
 
-/// Least standard deviation of a network's flow, pixels.
-const SIGMA_FLOOR: f32 = 0.03;
+/// Least standard deviation of a network's match, pixels of the images that are matched.
+const LEAST_SIGMA: f32 = 0.03;
 
 impl PairMatcher for LearnedTracker {
     type Error = LearnedError;
 
-    const SMOOTHS_REST: bool = false;
+    const NOISE: Noise = Noise::Unknown(LEAST_SIGMA);
 
     fn both_ways(
         &self,
@@ -50,8 +50,7 @@ impl LearnedTracker {
         // Halving an image of twice the side or more leaves the side; `seen` is the largest that is not halved.
         let seen = 2 * self.network.longest_side() as u32 - 1;
         let [max_side, full_side] = [settings.max_side, settings.full_side].map(|side| side.max(seen));
-        let sigma_floor = settings.sigma_floor.max(SIGMA_FLOOR);
-        TrackingSettings { max_side, full_side, sigma_floor, ..settings.clone() }
+        TrackingSettings { max_side, full_side, ..settings.clone() }
     }
 
     fn flow(&self, first: &Input, second: &Input) -> Result<Flow, LearnedError> {
