@@ -130,7 +130,7 @@ struct Prepared {
 impl Prepared {
     /// What an image of the same size without contrast becomes.
     fn flat(image: &Self) -> Self {
-        let channels = image.channels.each_ref().map(|channel| vec![step(0.0); channel.len()]);
+        let channels = image.channels.each_ref().map(|channel| vec![in_steps(0.0); channel.len()]);
         Self { channels, ..*image }
     }
 
@@ -144,7 +144,7 @@ impl Prepared {
                 let row = y.saturating_sub(RADIUS).min(height - 1) * width;
                 let short = |x: usize| {
                     let value = 0.5 * (channel[row + x] + box3[row + x]);
-                    step(value)
+                    in_steps(value)
                 };
                 shorts.extend([short(0); RADIUS]);
                 shorts.extend((0..width).map(short));
@@ -159,7 +159,7 @@ impl Prepared {
 }
 
 /// A distance from the mean in steps.
-fn step(value: f32) -> u16 {
+fn in_steps(value: f32) -> u16 {
     (UNIT * (value.clamp(-CONTRAST, CONTRAST) + CONTRAST)).round() as u16
 }
 
