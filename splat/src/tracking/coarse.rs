@@ -26,8 +26,8 @@ const HIGH_PASS_RADIUS: usize = 6;
 const UNIT: f32 = 104.5;
 /// Largest distance from that mean that is told apart, 0 to 255 scale: differences stay below 32 768 steps.
 const CONTRAST: f32 = 156.0;
-/// Cost below which every window rests: noise of 0.7 grey levels in the searched image, which averages many pixels. Its
-/// difference between two frames is 0.57 after smoothing, root mean square.
+/// Cost up to which every window rests: a third of a squared grey level per channel. Noise of up to 0.6 grey levels in
+/// the searched image, which averages many pixels, stays below it in every window.
 const AT_REST: u16 = (CHANNELS * SIDE * SIDE) as u16 / 9;
 /// Share of its own contrast by which a window that rests may differ besides, as sampling noise does.
 const RESTLESS: u16 = 16;
