@@ -6,7 +6,7 @@ use std::arch::x86_64::*;
 /// Numbers per group.
 pub(crate) const SHORTS: usize = 16;
 
-/// A group of [`SHORTS`] whole numbers from 0 to 32 767.
+/// A group of [`SHORTS`] whole numbers from 0 to 65 535.
 ///
 /// # Contract
 /// That of [`Simd`](super::Simd), which names the implementation for each instruction set.
@@ -14,11 +14,11 @@ pub(crate) trait Shorts: Copy {
     fn splat(value: u16) -> Self;
     fn load(from: &[u16; SHORTS]) -> Self;
     fn store(self, to: &mut [u16; SHORTS]);
-    /// The sum, which must be below 32 768.
+    /// The sum, or 65 535 where that is less.
     fn add(self, other: Self) -> Self;
     /// The difference, which must not be negative.
     fn sub(self, other: Self) -> Self;
-    /// The squared difference over 65 536, rounded down.
+    /// The squared difference over 32 768, rounded to the nearest, halves up; both must be below 32 768.
     fn squared_difference(self, other: Self) -> Self;
     fn min(self, other: Self) -> Self;
     /// Bit `n` says whether lane `n` is below that of the other group.
@@ -41,7 +41,7 @@ impl Shorts for PlainShorts {
     #[inline(always)]
     fn add(mut self, other: Self) -> Self {
         for lane in 0..SHORTS {
-            self.0[lane] += other.0[lane];
+            self.0[lane] = self.0[lane].saturating_add(other.0[lane]);
         }
         self
     }
@@ -56,7 +56,7 @@ impl Shorts for PlainShorts {
     fn squared_difference(mut self, other: Self) -> Self {
         for lane in 0..SHORTS {
             let difference = i32::from(self.0[lane]) - i32::from(other.0[lane]);
-            self.0[lane] = ((difference * difference) >> u16::BITS) as u16;
+            self.0[lane] = ((difference * difference + (1 << 14)) >> 15) as u16;
         }
         self
     }
@@ -112,7 +112,7 @@ impl Shorts for Avx2Shorts {
     }
     #[inline(always)]
     fn add(self, other: Self) -> Self {
-        Self(intrinsic!(_mm256_add_epi16(self.0, other.0)))
+        Self(intrinsic!(_mm256_adds_epu16(self.0, other.0)))
     }
     #[inline(always)]
     fn sub(self, other: Self) -> Self {
@@ -120,19 +120,21 @@ impl Shorts for Avx2Shorts {
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        Self(intrinsic!(_mm256_min_epi16(self.0, other.0)))
+        Self(intrinsic!(_mm256_min_epu16(self.0, other.0)))
     }
     #[inline(always)]
     fn squared_difference(self, other: Self) -> Self {
         let difference = intrinsic!(_mm256_sub_epi16(self.0, other.0));
-        Self(intrinsic!(_mm256_mulhi_epi16(difference, difference)))
+        Self(intrinsic!(_mm256_mulhrs_epi16(difference, difference)))
     }
     #[inline(always)]
     fn below(self, other: Self) -> u16 {
+        // Comparisons are signed, maxima are not.
         intrinsic!({
-            let below = _mm256_cmpgt_epi16(other.0, self.0);
-            let bytes = _mm_packs_epi16(_mm256_castsi256_si128(below), _mm256_extracti128_si256::<1>(below));
-            _mm_movemask_epi8(bytes) as u16
+            let reaches = _mm256_cmpeq_epi16(_mm256_max_epu16(self.0, other.0), self.0);
+            let bytes =
+                _mm_packs_epi16(_mm256_castsi256_si128(reaches), _mm256_extracti128_si256::<1>(reaches));
+            !(_mm_movemask_epi8(bytes) as u16)
         })
     }
 }
@@ -144,33 +146,53 @@ mod tests {
 
     type Results = [[u16; SHORTS]; 5];
 
-    simd_kernel! { fn operate(a: &[u16; SHORTS], b: &[u16; SHORTS], results: &mut Results) = operate_kernel }
+    simd_kernel! {
+        /// The last operation takes halves of the numbers.
+        fn operate(a: &[u16; SHORTS], b: &[u16; SHORTS], halves: &[[u16; SHORTS]; 2], results: &mut Results)
+            = operate_kernel
+    }
 
     #[inline(always)]
-    fn operate_kernel<S: Simd>(a: &[u16; SHORTS], b: &[u16; SHORTS], results: &mut Results) {
+    fn operate_kernel<S: Simd>(
+        a: &[u16; SHORTS],
+        b: &[u16; SHORTS],
+        halves: &[[u16; SHORTS]; 2],
+        results: &mut Results,
+    ) {
         let (x, y) = (S::Shorts::load(a), S::Shorts::load(b));
         x.add(y).store(&mut results[0]);
-        x.add(y).sub(y).store(&mut results[1]);
+        x.sub(x.min(y)).store(&mut results[1]);
         x.min(y).store(&mut results[2]);
-        x.squared_difference(y).store(&mut results[3]);
-        S::Shorts::splat(x.below(y)).store(&mut results[4]);
+        S::Shorts::splat(x.below(y)).store(&mut results[3]);
+        let (x, y) = (S::Shorts::load(&halves[0]), S::Shorts::load(&halves[1]));
+        x.squared_difference(y).store(&mut results[4]);
     }
 
     #[test]
     fn every_instruction_set_computes_exactly() {
         for n in 0..100u32 {
-            // Sums below 32 768, differences of either sign.
-            let a: [u16; SHORTS] =
-                std::array::from_fn(|lane| (n * 5003 + lane as u32 * 3701) as u16 % 20_000);
-            let b: [u16; SHORTS] =
-                std::array::from_fn(|lane| (n * 2003 + lane as u32 * 7919) as u16 % 12_700);
+            let mut a: [u16; SHORTS] = std::array::from_fn(|lane| (n * 5003 + lane as u32 * 13_701) as u16);
+            let mut b: [u16; SHORTS] = std::array::from_fn(|lane| (n * 2003 + lane as u32 * 7919) as u16);
+            // The largest square, equals, and the last square that vanishes beside the first that does not.
+            (a[0], b[0]) = (0, u16::MAX);
+            b[1] = a[1];
+            (a[2], b[2], a[3], b[3]) = (254, 0, 256, 0);
             let below = (0..SHORTS).map(|lane| u16::from(a[lane] < b[lane]) << lane).sum();
             let each = |of: fn(u16, u16) -> u16| std::array::from_fn(|lane| of(a[lane], b[lane]));
-            let square = |a: u16, b: u16| (u32::from(a.abs_diff(b)).pow(2) >> 16) as u16;
-            let expected: Results = [each(|a, b| a + b), a, each(u16::min), each(square), [below; SHORTS]];
+            let rounded_square = |a: u16, b: u16| {
+                (f64::from(i32::from(a / 2) - i32::from(b / 2)).powi(2) / 32_768.0).round() as u16
+            };
+            let expected: Results = [
+                each(u16::saturating_add),
+                each(u16::saturating_sub),
+                each(u16::min),
+                [below; SHORTS],
+                each(rounded_square),
+            ];
+            assert_eq!(expected[4][..4], [32_766, 0, 0, 1]);
             for instructions in Instructions::available() {
                 let mut results = [[0; SHORTS]; 5];
-                operate(instructions, &a, &b, &mut results);
+                operate(instructions, &a, &b, &[a.map(|v| v / 2), b.map(|v| v / 2)], &mut results);
                 assert_eq!(results, expected, "{}", instructions.set());
             }
         }

@@ -14,20 +14,25 @@ pub(super) struct CoarseMatches {
     pub(super) backward: Flow,
 }
 
+/// Red, green and blue.
+const CHANNELS: usize = 3;
 /// Half side of the compared windows.
 const RADIUS: usize = 2;
 /// Their side.
 const SIDE: usize = 2 * RADIUS + 1;
 /// Half side of the windows whose mean is removed first. Wide, so that a patch keeps its colour.
 const HIGH_PASS_RADIUS: usize = 6;
-/// Largest distance from that mean that is told apart, 0 to 255 scale.
-const CONTRAST: f32 = 109.0;
-/// Steps per grey level: squared differences over 65 536 are those of grey levels over eight.
-const UNIT: f32 = 90.51;
-/// Cost below which a window rests: two grey levels, root mean square, are noise.
-const AT_REST: u16 = (3 * SIDE * SIDE * 4 / 8) as u16;
-/// What a pixel counts at most: sums over a window are below 32 768.
-const MOST: u16 = (i16::MAX as usize / (SIDE * SIDE)) as u16;
+/// Steps per grey level: squared differences over 32 768 are a third of those of grey levels, so 1.2 of them count.
+const UNIT: f32 = 104.5;
+/// Largest distance from that mean that is told apart, 0 to 255 scale: differences stay below 32 768 steps.
+const CONTRAST: f32 = 156.0;
+/// Cost up to which every window rests: a third of a squared grey level per channel. Noise of up to 0.6 grey levels in
+/// the searched image, which averages many pixels, stays below it in every window.
+const AT_REST: u16 = (CHANNELS * SIDE * SIDE) as u16 / 9;
+/// Share of its own contrast by which a window that rests may differ besides, as sampling noise does.
+const RESTLESS: u16 = 16;
+/// What a pixel counts at most: sums over a window are below 65 535.
+const MOST: u16 = u16::MAX / (SIDE * SIDE) as u16;
 
 /// Largest distance along either axis between a pixel and where it comes back to, pixels.
 const ROUND_TRIP: f32 = 1.0;
@@ -36,23 +41,27 @@ const ROUND_TRIP: f32 = 1.0;
 struct Best {
     /// Cost and number of the displacement, which decides among equal costs.
     best: Vec<u64>,
-    /// What a cost must be below to be better or equal; 0 where it is perfect.
+    /// What a cost must be below to be taken into account.
     limit: Vec<u16>,
 }
 
 impl Best {
     fn new(pixels: usize) -> Self {
-        Self { best: vec![u64::MAX; pixels + SHORTS], limit: vec![i16::MAX as u16; pixels + SHORTS] }
+        Self { best: vec![u64::MAX; pixels + SHORTS], limit: vec![u16::MAX; pixels + SHORTS] }
     }
 
-    /// The pixels whose windows differ at the only displacement that was compared so far, and what lies between them.
-    fn not_at_rest(&self, width: usize) -> Region {
+    /// The pixels whose windows differ at the only displacement that was compared so far, and what lies between them;
+    /// `contrasts` are the costs of windows without any.
+    fn not_at_rest(&self, contrasts: &Self, width: usize) -> Region {
+        let restless = |(&cost, &contrast): (&u16, &u16)| cost > AT_REST + contrast / RESTLESS;
         let mut region = Region { first_column: width, first_row: 0, columns: 0, rows: 0 };
         let mut end = 0;
-        let rows = self.limit[..self.limit.len() - SHORTS].chunks_exact(width);
-        for (y, row) in rows.enumerate() {
-            let Some(from) = row.iter().position(|&limit| limit > AT_REST) else { continue };
-            let to = width - row.iter().rev().take_while(|&&limit| limit <= AT_REST).count();
+        let pixels = self.limit.len() - SHORTS;
+        let rows = self.limit[..pixels].chunks_exact(width).zip(contrasts.limit.chunks_exact(width));
+        for (y, (costs, contrasts)) in rows.enumerate() {
+            let mut row = costs.iter().zip(contrasts);
+            let Some(from) = row.clone().position(restless) else { continue };
+            let to = row.rposition(restless).map_or(from, |last| last + 1);
             if region.rows == 0 {
                 region.first_row = y;
             }
@@ -77,10 +86,10 @@ impl Best {
 ///
 /// Of equal costs the smallest displacement wins, so identical images match at zero. Outside the rectangle around all
 /// windows that differ by more than noise everything rests.
-pub(super) fn search<const C: usize>(
+pub(super) fn search(
     instructions: Instructions,
-    first: &Planes<C>,
-    second: &Planes<C>,
+    first: &Planes,
+    second: &Planes,
     radius: usize,
 ) -> CoarseMatches {
     let (width, height) = (first.width, first.height);
@@ -111,15 +120,21 @@ fn verify(flow: &mut Flow, back: &Flow) {
 
 /// Channels without their local mean, smoothed a little as a displacement of half a coarse pixel must not hide a match,
 /// with [`RADIUS`] replicated pixels on every side.
-struct Prepared<const C: usize> {
+struct Prepared {
     width: usize,
     height: usize,
     stride: usize,
-    channels: [Vec<u16>; C],
+    channels: [Vec<u16>; CHANNELS],
 }
 
-impl<const C: usize> Prepared<C> {
-    fn of(planes: &Planes<C>) -> Self {
+impl Prepared {
+    /// What an image of the same size without contrast becomes.
+    fn flat(image: &Self) -> Self {
+        let channels = image.channels.each_ref().map(|channel| vec![in_steps(0.0); channel.len()]);
+        Self { channels, ..*image }
+    }
+
+    fn of(planes: &Planes) -> Self {
         let (width, height) = (planes.width, planes.height);
         let stride = width + 2 * RADIUS;
         let channels = planes.high_passed(HIGH_PASS_RADIUS).map(|channel| {
@@ -129,7 +144,7 @@ impl<const C: usize> Prepared<C> {
                 let row = y.saturating_sub(RADIUS).min(height - 1) * width;
                 let short = |x: usize| {
                     let value = 0.5 * (channel[row + x] + box3[row + x]);
-                    (UNIT * (value.clamp(-CONTRAST, CONTRAST) + CONTRAST)) as u16
+                    in_steps(value)
                 };
                 shorts.extend([short(0); RADIUS]);
                 shorts.extend((0..width).map(short));
@@ -141,6 +156,11 @@ impl<const C: usize> Prepared<C> {
         });
         Self { width, height, stride, channels }
     }
+}
+
+/// A distance from the mean in steps.
+fn in_steps(value: f32) -> u16 {
+    (UNIT * (value.clamp(-CONTRAST, CONTRAST) + CONTRAST)).round() as u16
 }
 
 fn displacements_by_length(radius_x: usize, radius_y: usize) -> Vec<[i32; 2]> {
@@ -155,17 +175,13 @@ fn length_first(&[dx, dy]: &[i32; 2]) -> (i32, i32, i32) {
 }
 
 simd_kernel! {
-    fn compare_all<const C: usize>(
-        images: &[Prepared<C>; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
+    fn compare_all(
+        images: &[Prepared; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2],
     ) = compare_kernel
 }
 
 #[inline(always)]
-fn compare_kernel<S: Simd, const C: usize>(
-    images: &[Prepared<C>; 2],
-    displacements: &[[i32; 2]],
-    matches: &mut [Best; 2],
-) {
+fn compare_kernel<S: Simd>(images: &[Prepared; 2], displacements: &[[i32; 2]], matches: &mut [Best; 2]) {
     let mut sums = WindowSums::new(images[0].width);
     let mut region = Region::all(&images[0]);
     let mut shorter = 0;
@@ -174,10 +190,17 @@ fn compare_kernel<S: Simd, const C: usize>(
         for (n, &displacement) in equally_long.iter().enumerate() {
             // Where one displacement is the nth of its length, its opposite is the nth from the end.
             let labels = [shorter + n as u32, shorter + (last - n) as u32];
-            sums.compare::<S::Shorts, C>(images, region.overlap(displacement), labels, matches);
+            let [first, second] = images;
+            sums.compare::<S::Shorts>([first, second], region.overlap(displacement), labels, matches);
         }
         if shorter == 0 {
-            region = matches[0].not_at_rest(images[0].width);
+            // The lesser contrast of both images: what appears on something flat does not rest.
+            let flat = Prepared::flat(&images[0]);
+            let mut contrasts = [(); 2].map(|()| Best::new(flat.width * flat.height));
+            for image in images {
+                sums.compare::<S::Shorts>([image, &flat], region.overlap([0, 0]), [0, 0], &mut contrasts);
+            }
+            region = matches[0].not_at_rest(&contrasts[0], flat.width);
         }
         shorter += equally_long.len() as u32;
     }
@@ -193,7 +216,7 @@ struct Region {
 }
 
 impl Region {
-    fn all<const C: usize>(image: &Prepared<C>) -> Self {
+    fn all(image: &Prepared) -> Self {
         Self { first_column: 0, first_row: 0, columns: image.width, rows: image.height }
     }
 
@@ -235,9 +258,9 @@ impl WindowSums {
 
     /// Offers the windows of an overlap to the pixels of both images.
     #[inline(always)]
-    fn compare<S: Shorts, const C: usize>(
+    fn compare<S: Shorts>(
         &mut self,
-        images: &[Prepared<C>; 2],
+        images: [&Prepared; 2],
         overlap: Overlap,
         labels: [u32; 2],
         matches: &mut [Best; 2],
@@ -254,7 +277,7 @@ impl WindowSums {
         // Sums are read a row later: what was just written is not yet in the cache.
         for line in 0..=lines {
             if line < lines {
-                self.add_row::<S, C>(images, &overlap, line);
+                self.add_row::<S>(images, &overlap, line);
             }
             let Some(row) = line.checked_sub(SIDE) else { continue };
             let first = (within.first_row + row) * width + within.first_column;
@@ -266,21 +289,16 @@ impl WindowSums {
     /// Takes in a row of squared differences, the first of which lies [`RADIUS`] rows before the overlap, and forgets that
     /// of [`SIDE`] rows before.
     #[inline(always)]
-    fn add_row<S: Shorts, const C: usize>(
-        &mut self,
-        images: &[Prepared<C>; 2],
-        overlap: &Overlap,
-        line: usize,
-    ) {
+    fn add_row<S: Shorts>(&mut self, images: [&Prepared; 2], overlap: &Overlap, line: usize) {
         let [first, second] = images;
         let groups = (self.columns + 2 * RADIUS).div_ceil(SHORTS);
         let [dx, dy] = overlap.displacement.map(i64::from);
         // The border shifts both axes by the radius, and the first row and column lie as far before the overlap.
         let at = (overlap.within.first_row + line) * first.stride + overlap.within.first_column;
         let shifted = (at as i64 + dy * second.stride as i64 + dx) as usize;
-        let mut here: [&[[u16; SHORTS]]; C] = [&[]; C];
-        let mut there: [&[[u16; SHORTS]]; C] = [&[]; C];
-        for c in 0..C {
+        let mut here: [&[[u16; SHORTS]]; CHANNELS] = [&[]; CHANNELS];
+        let mut there: [&[[u16; SHORTS]]; CHANNELS] = [&[]; CHANNELS];
+        for c in 0..CHANNELS {
             here[c] = in_groups(&first.channels[c], at, groups);
             there[c] = in_groups(&second.channels[c], shifted, groups);
         }
@@ -290,7 +308,7 @@ impl WindowSums {
         let (before, after) = (in_groups(before, 0, groups), in_groups_mut(after, 0, groups));
         for group in 0..groups {
             let mut squares = S::splat(0);
-            for c in 0..C {
+            for c in 0..CHANNELS {
                 let (a, b) = (S::load(&here[c][group]), S::load(&there[c][group]));
                 squares = squares.add(a.squared_difference(b));
             }
@@ -310,6 +328,9 @@ impl WindowSums {
         for k in 0..SIDE {
             shifted[k] = in_groups(&self.sums, line % 2 * self.stride + k, groups);
         }
+        // Of equal costs the smaller number wins. Forwards numbers ascend, so what comes later must be better; backwards
+        // they descend among equally long displacements.
+        let ties = u16::from(labels[1] > 0);
         let [forward, backward] = matches;
         let here = in_groups_mut(&mut forward.limit, at[0], groups);
         let there = in_groups_mut(&mut backward.limit, at[1], groups);
@@ -329,22 +350,29 @@ impl WindowSums {
             costs.store(&mut values);
             let bests = [&mut forward.best[at[0] + column..], &mut backward.best[at[1] + column..]];
             let [best_here, best_there] = bests;
-            take(best_here, &mut here[group], better_here, &values, labels[0]);
-            take(best_there, &mut there[group], better_there, &values, labels[1]);
+            take(best_here, &mut here[group], better_here, &values, labels[0], 0);
+            take(best_there, &mut there[group], better_there, &values, labels[1], ties);
         }
     }
 }
 
-/// Compares those pixels of a group whose bits are set.
+/// Compares those pixels of a group whose bits are set. Later costs count if they are below these plus `ties`.
 #[inline(always)]
-fn take(best: &mut [u64], limit: &mut [u16; SHORTS], mut bits: u16, costs: &[u16; SHORTS], label: u32) {
+fn take(
+    best: &mut [u64],
+    limit: &mut [u16; SHORTS],
+    mut bits: u16,
+    costs: &[u16; SHORTS],
+    label: u32,
+    ties: u16,
+) {
     while bits != 0 {
         let lane = bits.trailing_zeros() as usize;
         bits &= bits - 1;
         let offered = u64::from(costs[lane]) << u32::BITS | u64::from(label);
         if offered < best[lane] {
             best[lane] = offered;
-            limit[lane] = if costs[lane] == 0 { 0 } else { costs[lane] + 1 };
+            limit[lane] = costs[lane] + ties;
         }
     }
 }
@@ -362,141 +390,4 @@ fn in_groups<T>(values: &[T], first: usize, groups: usize) -> &[[T; SHORTS]] {
 }
 
 #[cfg(test)]
-mod tests {
-    use rand::{RngExt as _, SeedableRng as _};
-
-    use super::*;
-
-    fn noise(seed: u64, count: usize) -> Vec<[f32; 3]> {
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-        (0..count).map(|_| random.random::<[f32; 3]>().map(|v| 255.0 * v)).collect()
-    }
-
-    fn planes(width: usize, height: usize, colour: impl Fn(usize, usize) -> [f32; 3]) -> Planes {
-        let channel = |c: usize| (0..width * height).map(|i| colour(i % width, i / width)[c]).collect();
-        Planes::from_interiors(width, height, [channel(0), channel(1), channel(2)])
-    }
-
-    /// A square of noise in front of a wall of noise.
-    fn square_at(x0: usize, y0: usize) -> Planes {
-        let (wall, square) = (noise(2, 61 * 43), noise(3, 12 * 12));
-        planes(61, 43, |x, y| match (x.checked_sub(x0), y.checked_sub(y0)) {
-            (Some(u @ 0..12), Some(v @ 0..12)) => square[v * 12 + u],
-            _ => wall[y * 61 + x],
-        })
-    }
-
-    /// Every window of the first image against every one of the second, one number at a time: the best displacement.
-    fn best_matches(first: &Prepared<3>, second: &Prepared<3>, radius: i32) -> Vec<[i32; 2]> {
-        let (width, height) = (first.width as i32, first.height as i32);
-        let value = |image: &Prepared<3>, c: usize, x: i32, y: i32| {
-            let at = (y + RADIUS as i32) * image.stride as i32 + x + RADIUS as i32;
-            i32::from(image.channels[c][at as usize])
-        };
-        let window = -(RADIUS as i32)..=RADIUS as i32;
-        let cost = |x: i32, y: i32, [dx, dy]: [i32; 2]| -> u32 {
-            let pixel = |x: i32, y: i32| {
-                let square =
-                    |c| (value(first, c, x, y) - value(second, c, x + dx, y + dy)).pow(2) as u32 >> 16;
-                (0..3).map(square).sum::<u32>().min(u32::from(MOST))
-            };
-            window
-                .clone()
-                .flat_map(|v| window.clone().map(move |u| (u, v)))
-                .map(|(u, v)| pixel(x + u, y + v))
-                .sum()
-        };
-        let best = |x: i32, y: i32| {
-            let inside =
-                |[dx, dy]: &[i32; 2]| (0..width).contains(&(x + dx)) && (0..height).contains(&(y + dy));
-            let all = displacements_by_length(radius as usize, radius as usize).into_iter().filter(inside);
-            all.min_by_key(|&displacement| cost(x, y, displacement)).unwrap_or_default()
-        };
-        (0..width * height).map(|i| best(i % width, i / width)).collect()
-    }
-
-    #[test]
-    fn the_search_agrees_with_one_number_at_a_time_on_every_instruction_set() {
-        // Everything changes, so everything is searched; sizes and windows are no whole groups.
-        let (wide, other) = (noise(4, 80 * 60), noise(5, 80 * 60));
-        let first = planes(37, 21, |x, y| wide[y * 80 + x + 9]);
-        let second = planes(37, 21, |x, y| if x < 20 { wide[(y + 3) * 80 + x] } else { other[y * 80 + x] });
-        let (a, b) = (Prepared::of(&first), Prepared::of(&second));
-        let (there, back) = (best_matches(&a, &b, 11), best_matches(&b, &a, 11));
-        for instructions in Instructions::available() {
-            let matches = search(instructions, &first, &second, 11);
-            for (found, best, other) in
-                [(&matches.forward, &there, &back), (&matches.backward, &back, &there)]
-            {
-                for (i, &[dx, dy]) in best.iter().enumerate() {
-                    let [bx, by] = other[(i as i32 + dy * 37 + dx) as usize];
-                    let leads_back = (dx + bx).abs() <= 1 && (dy + by).abs() <= 1;
-                    assert_eq!(found.u[i].is_finite(), leads_back, "{} {i}", instructions.set());
-                    if leads_back {
-                        assert_eq!([found.u[i], found.v[i]], [dx as f32, dy as f32]);
-                    }
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn leaving_out_what_rests_loses_no_match() {
-        let (first, second) = (square_at(6, 8), square_at(29, 20));
-        let (a, b) = (Prepared::of(&first), Prepared::of(&second));
-        let (there, back) = (best_matches(&a, &b, 25), best_matches(&b, &a, 25));
-        let found = search(Instructions::detect(), &first, &second, 25).forward;
-        let mut jumped = 0;
-        for (i, &[dx, dy]) in there.iter().enumerate() {
-            let [bx, by] = back[(i as i32 + dy * 61 + dx) as usize];
-            if (dx + bx).abs() <= 1 && (dy + by).abs() <= 1 {
-                assert_eq!([found.u[i], found.v[i]], [dx as f32, dy as f32], "{i}");
-                jumped += usize::from([dx, dy] == [23, 12]);
-            }
-        }
-        // Windows that lie inside the square see nothing else.
-        assert!(jumped >= 8 * 8, "{jumped}");
-    }
-
-    #[test]
-    fn only_the_rectangle_of_what_differs_is_searched() {
-        let mut best = Best::new(7 * 5);
-        best.limit.fill(AT_REST);
-        assert_eq!(best.not_at_rest(7).columns * best.not_at_rest(7).rows, 0);
-        best.limit[7 + 4] = AT_REST + 1;
-        best.limit[3 * 7 + 2] = AT_REST + 1;
-        assert_eq!(best.not_at_rest(7), Region { first_column: 2, first_row: 1, columns: 3, rows: 3 });
-        best.limit.fill(i16::MAX as u16);
-        assert_eq!(best.not_at_rest(7), Region { first_column: 0, first_row: 0, columns: 7, rows: 5 });
-    }
-
-    #[test]
-    fn shifts_up_to_the_radius_are_found_both_ways() {
-        let (width, height) = (40, 30);
-        let wide = noise(1, 100 * 100);
-        let crop = |x0: usize, y0: usize| planes(width, height, |x, y| wide[(y0 + y) * 100 + x0 + x]);
-        let matches = search(Instructions::detect(), &crop(30, 30), &crop(19, 36), 12);
-        let (mut right, mut all) = (0, 0);
-        for y in 10..height - 10 {
-            for x in 3..width - 15 {
-                all += 2;
-                right += usize::from(matches.forward.at(x, y) == [11.0, -6.0]);
-                right += usize::from(matches.backward.at(x + 11, y - 6) == [-11.0, 6.0]);
-            }
-        }
-        assert_eq!(right, all);
-        let limited = search(Instructions::detect(), &crop(30, 30), &crop(19, 36), 5);
-        assert!(
-            limited
-                .forward
-                .u
-                .iter()
-                .chain(&limited.backward.v)
-                .all(|value| value.is_nan() || value.abs() <= 5.0)
-        );
-        assert_eq!(
-            search(Instructions::detect(), &crop(0, 0), &crop(0, 0), 12).forward,
-            Flow::zeros(width, height)
-        );
-    }
-}
+mod tests;

@@ -38,7 +38,7 @@ pub struct TrackingSettings {
     #[serde(deserialize_with = "range::whole::<1, 100_000, _>")]
     pub window: u32,
     /// Levels whose longer side has more pixels than this are refined without matching patches; 0 to 65 536, default
-    /// 400, with `draft` 200, with `best` 1600.
+    /// 400, with `best` 1600.
     #[serde(deserialize_with = "range::whole::<0, 65_536, _>")]
     pub patch_side: u32,
     /// Distance of neighbouring patches at the full resolution of the pyramid, pixels; half of it, rounded up, at all
@@ -112,7 +112,6 @@ impl TrackingSettings {
                 max_side: 160,
                 search_side: 80,
                 gaps: vec![1],
-                patch_side: 200,
                 patch_stride: 5,
                 smoothing_warps: 1,
                 ..balanced
