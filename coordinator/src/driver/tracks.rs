@@ -23,6 +23,10 @@ use crate::{
     store::ViewRecord,
 };
 
+/// The window that keys of fields name: however views are cut, their fields are the same. A constant, so that the keys stay
+/// whatever the default becomes.
+const KEYED_WINDOW: u32 = 16;
+
 impl Job {
     /// Makes the static model while workers track.
     pub(super) async fn make_static_model_beside_tracks(&mut self) -> Result<(), StageError> {
@@ -90,9 +94,7 @@ impl Job {
 
     /// What is to be tracked, and what is in the store already.
     pub(super) async fn ledger(&self) -> Result<TrackLedger, StageError> {
-        // However views are cut, their fields are the same.
-        let window = TrackingSettings::default().window;
-        let uncut = TrackingSettings { window, ..self.settings.tracking.clone() };
+        let uncut = TrackingSettings { window: KEYED_WINDOW, ..self.settings.tracking.clone() };
         let settings_json = serde_json::to_string(&uncut).map_err(|error| {
             StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
         })?;
@@ -160,7 +162,9 @@ impl Job {
             let tracks: Option<Blob> = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
             fields.push(Field { frame, image, key, tracks });
             if index % window == 0 && index < last {
-                let key = digest_of(&("track state", VERSION, &own_key));
+                // Of the job and the view alone: each discards its own.
+                let format = track_state::VERSION;
+                let key = digest_of(&("track state", VERSION, format, &*self.id, position, &own_key));
                 let blob = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
                 states.push(State { key, blob });
             }

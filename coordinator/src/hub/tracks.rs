@@ -145,8 +145,12 @@ impl Hub {
         let id = uuid::Uuid::now_v7().simple().to_string();
         let Some(lease) = desk.queue.lease_own(job, Instant::now(), id) else { return Ok(None) };
         self.record_grant(&lease).await?;
-        let request = self.track_job(&mut desk, job, lease.key.task.number()).await?;
-        Ok(request.map(|request| (lease, request)))
+        let position = lease.key.task.number();
+        let request = self.track_job(&mut desk, job, position).await?.ok_or_else(|| {
+            let message = format!("the job has no view {position} to track: a defect of the coordinator");
+            StageError::new(FailureKind::Bug, message)
+        })?;
+        Ok(Some((lease, request)))
     }
 
     /// What whoever leases a view gets.
