@@ -354,6 +354,74 @@ async fn jobs_of_one_clip_keep_their_states_apart() {
 }
 
 #[tokio::test]
+async fn a_state_that_cannot_be_gone_on_from_is_made_again_and_the_failure_counts() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let key = TaskKey { job: job.as_str().into(), task: Task::Tracks(0) };
+    for failures in 1..=3 {
+        let lease = worker.window(&bench).await;
+        assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
+        assert!(worker.fail(&lease, FailureKind::Bug).await.accepted);
+        let record = bench.hub().store.task(&key).await.unwrap().unwrap();
+        assert_eq!(record.failures, failures, "a state that is made again is no progress");
+        if failures < 3 {
+            let lease = worker.window(&bench).await;
+            assert_eq!((leased(&lease), track_job(&lease).state), (("cam00".into(), vec![2, 3]), None));
+            worker.finish(&bench, &lease).await;
+        }
+    }
+    let (state, failure) = bench.ended(&job).await;
+    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Bug));
+    assert!(!state_file(&bench, "cam00", 2).exists(), "a resubmission begins before it");
+}
+
+#[tokio::test]
+async fn a_store_that_keeps_no_state_fails_the_job() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let mut refused = Vec::new();
+    for _ in 0..5 {
+        remove_state(&bench, "cam00", 2);
+        let lease = worker.window(&bench).await;
+        assert_eq!(leased(&lease), ("cam00".into(), vec![2, 3]));
+        let tracked = window(&bench, &lease).await;
+        let receipt = worker.report(&lease, Outcome::Tracked(tracked)).await;
+        refused.push((!receipt.accepted).then_some(receipt.reason));
+    }
+    assert!(refused[..2].iter().all(Option::is_none), "{refused:?}");
+    assert!(refused[2..].iter().flatten().all(|reason| reason.contains("check its disk")), "{refused:?}");
+    let (state, failure) = bench.ended(&job).await;
+    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Transient));
+}
+
+#[tokio::test]
+async fn states_that_a_killed_coordinator_left_behind_are_removed() {
+    let mut bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let id: crate::queue::JobId = job.as_str().into();
+    let first = bench.hub().tracks(&id, |ledger| ledger.next_state(0)).await.unwrap().unwrap();
+    let windows = worker.finish_job(&bench, &job).await;
+    assert_eq!(windows.len(), 6);
+    bench.stop().await;
+    // As it is left between the report that completes a view and the removal of its states.
+    let blob = first.blob.unwrap();
+    let store = crate::store::Store::open(&bench.options.root.join("state.sqlite")).await.unwrap();
+    let mut change = store.change().await.unwrap();
+    let artifact = crate::store::Artifact { blob: blob.clone(), note: String::new() };
+    change.put_artifact(&first.key, "track-state", &artifact).await.unwrap();
+    change.commit().await.unwrap();
+    store.close().await;
+    let file = state_file(&bench, "cam00", 2);
+    std::fs::write(&file, state_of("cam00", 2)).unwrap();
+    std::fs::remove_dir_all(bench.path("out")).unwrap();
+    bench.restart().await;
+    assert!(bench.submit(request(&bench, 2)).await.unwrap().resumed);
+    let mut worker = bench.worker("w").await;
+    assert!(worker.finish_job(&bench, &job).await.is_empty());
+    assert!(!file.exists() && bench.hub().store.artifact(&first.key).await.unwrap().is_none());
+}
+
+#[tokio::test]
 async fn a_window_needs_its_state_and_one_of_its_own_frames() {
     let bench = bench().await;
     let mut worker = bench.worker("w").await;
