@@ -26,6 +26,8 @@ pub(crate) struct TrackLedger {
     views: BTreeMap<u32, TrackedView>,
     /// What the last lease of each view covers.
     leased: BTreeMap<u32, Window>,
+    /// States lost of each view since its last new field.
+    lost: BTreeMap<u32, u32>,
     /// Fields that are there, and all.
     counts: (u64, u64),
     failed: Option<Failure>,
@@ -42,7 +44,7 @@ pub(crate) struct TrackedView {
     pub(crate) key_image: Blob,
     /// In order of frames, those after the key frame.
     pub(crate) fields: Vec<Field>,
-    /// Fields per window.
+    /// Fields per window, at least one.
     pub(crate) window: usize,
     /// The tracker's states after every window but the last.
     pub(crate) states: Vec<State>,
@@ -57,8 +59,8 @@ pub(crate) struct State {
     pub(crate) blob: Option<Blob>,
 }
 
-/// What one lease covers: consecutive fields of a view.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// What one lease covers: consecutive fields of a view; none where only the report is left.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Window {
     number: usize,
     /// By index.
@@ -93,10 +95,9 @@ impl TrackedView {
         let first_missing = self.fields.iter().position(is_missing)?;
         let last_missing = self.fields.iter().rposition(is_missing)?;
         let is_there = |number: &usize| *number == 0 || self.state(number - 1).is_some();
-        let window = self.window.max(1);
-        let number = (0..=first_missing / window).rev().find(is_there)?;
-        let start = number * window;
-        let end = (start + window).min(self.fields.len());
+        let number = (0..=first_missing / self.window).rev().find(is_there)?;
+        let start = number * self.window;
+        let end = start.saturating_add(self.window).min(self.fields.len());
         let wants_state = last_missing >= end && self.state(number).is_none();
         // Fields that exist after the last missing one are for nobody.
         let end = if wants_state { end } else { end.min(last_missing + 1) };
@@ -135,6 +136,7 @@ impl TrackLedger {
             reach,
             views,
             leased: BTreeMap::new(),
+            lost: BTreeMap::new(),
             counts,
             failed: None,
             adopted: BTreeSet::new(),
@@ -157,9 +159,10 @@ impl TrackLedger {
         self.views.get(&position).map_or("", |view| view.name.as_str())
     }
 
-    /// What a worker gets that is to go on with a view; `None` if nothing of it is to be tracked.
+    /// What a worker gets that is to go on with a view; `None` if there is no such view. Whoever made the last field may be
+    /// lost before its report: the window is empty then, and so is the report that ends the view.
     pub(crate) fn lease(&mut self, position: u32) -> Option<TrackJob> {
-        let window = self.views.get(&position)?.next()?;
+        let window = self.views.get(&position)?.next().unwrap_or_default();
         let job = self.job_of(position, &window);
         self.leased.insert(position, window);
         job
@@ -247,13 +250,23 @@ impl TrackLedger {
     /// A state is gone: what is tracked next begins before it.
     pub(crate) fn lose_state(&mut self, position: u32, key: &str) {
         let states = self.views.get_mut(&position).map(|view| view.states.iter_mut());
-        states.into_iter().flatten().filter(|state| state.key == key).for_each(|state| state.blob = None);
+        let of_key = |state: &&mut State| state.key == key && state.blob.is_some();
+        for state in states.into_iter().flatten().filter(of_key) {
+            state.blob = None;
+            *self.lost.entry(position).or_default() += 1;
+        }
     }
 
-    /// Takes the states of a view that nobody needs any more: those before the one to go on from.
+    /// States lost of a view since its last new field: many are a store that keeps none.
+    pub(crate) fn lost_states(&self, position: u32) -> u32 {
+        self.lost.get(&position).copied().unwrap_or_default()
+    }
+
+    /// Takes the states of a view that nobody needs any more: those before the one to go on from, but for the last of
+    /// them, from which the window before is repeated where that one is lost.
     pub(crate) fn take_superseded(&mut self, position: u32) -> Vec<State> {
         let Some(view) = self.views.get_mut(&position) else { return Vec::new() };
-        let needed = view.next().map_or(usize::MAX, |window| window.number.saturating_sub(1));
+        let needed = view.next().map_or(usize::MAX, |window| window.number.saturating_sub(2));
         let superseded = view.states.iter_mut().take(needed).filter(|state| state.blob.is_some());
         superseded.map(|state| State { key: state.key.clone(), blob: state.blob.take() }).collect()
     }
@@ -287,6 +300,7 @@ impl TrackLedger {
         if view.fields[index].tracks.is_none() {
             view.fields[index].tracks.clone_from(&found.tracks);
             self.counts.0 += 1;
+            self.lost.remove(&position);
         }
     }
 

@@ -260,16 +260,19 @@ fn one_worker_and_the_coordinator_alone_track_the_same_bytes_as_two_workers() {
 }
 
 #[test]
-fn a_worker_killed_while_it_tracks_a_view_changes_nothing() {
+fn a_worker_killed_while_it_tracks_a_view_in_windows_changes_nothing() {
     let output = tempfile::tempdir().unwrap();
-    let mut run = program::start(tracking(output.path(), 2));
+    // Three frames in two windows; the bytes are those of views that are tracked whole.
+    let cut = ["--set", "tracking.window=2"].map(str::to_owned);
+    let mut run = program::start(tracking(output.path(), 2).into_iter().chain(cut));
     run.wait_for(&["progress", "stage=\"tracking\"", "done=1"]);
     signal(run.children()[0], Signal::SIGKILL);
     let status = run.wait();
     assert!(status.success(), "{}", run.log());
     assert_same(output.path(), undisturbed_tracking());
-    let is_again = |line: &str| line.contains("tracks") && line.contains("attempt=2");
-    assert!(run.log().lines().any(is_again), "a lost view was leased again:\n{}", run.log());
+    let is_again = |line: &str| line.contains("tracks") && line.contains("attempt=3");
+    assert!(run.log().lines().any(is_again), "a window was leased again:\n{}", run.log());
+    assert!(run.log().contains("window tracked"), "views were cut:\n{}", run.log());
 }
 
 #[test]

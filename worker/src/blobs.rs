@@ -36,6 +36,17 @@ impl BlobError {
             Self::Corrupt { .. } | Self::Store(_) | Self::Transfer { .. } => FailureKind::Transient,
         }
     }
+
+    /// Whether the store does not hold the blob, or other bytes under its name.
+    pub(crate) fn is_lost(&self) -> bool {
+        match self {
+            Self::Corrupt { .. } | Self::Store(object_store::Error::NotFound { .. }) => true,
+            Self::Transfer { status, .. } => {
+                matches!(status.code(), tonic::Code::NotFound | tonic::Code::DataLoss)
+            }
+            Self::BadDigest(_) | Self::Store(_) => false,
+        }
+    }
 }
 
 /// Where the worker gets and puts blobs.

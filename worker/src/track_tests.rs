@@ -297,6 +297,32 @@ async fn windows_give_the_fields_of_the_whole_and_go_on_from_a_stored_state() {
 }
 
 #[tokio::test]
+async fn a_state_that_is_gone_or_damaged_is_reported_at_once() {
+    let coordinator = TestCoordinator::start().await;
+    let job = track_job(&coordinator, 4);
+    let damaged = coordinator.store(b"a state");
+    coordinator.damage(&damaged.digest);
+    let gone = Blob { digest: crate::blobs::digest_of(b"never stored"), size: 12 };
+    let (_worker, _shutdown) = start(&coordinator, 1);
+    let mut session = coordinator.welcome().await;
+    for (state, lease_id) in [(damaged, "damaged"), (gone, "gone")] {
+        // Any other transfer is tried again for minutes.
+        let outcome = outcome_of(&mut session, lease_id, cut(&job, 3, 1, Some(state)));
+        let outcome = tokio::time::timeout(Duration::from_secs(15), outcome).await.unwrap();
+        let report::Outcome::Failure(failure) = outcome else { panic!("{outcome:?}") };
+        assert_eq!(failure.kind(), FailureKind::Transient);
+    }
+}
+
+#[tokio::test]
+async fn a_window_of_no_frames_ends_in_an_empty_report() {
+    let coordinator = TestCoordinator::start().await;
+    let mut job = track_job(&coordinator, 1);
+    job.frames[0].image = None;
+    assert_eq!(tracked_with(&coordinator, 1, job).await, [], "not even the key frame is read");
+}
+
+#[tokio::test]
 async fn a_state_that_does_not_fit_is_a_defect_and_says_so() {
     let coordinator = TestCoordinator::start().await;
     let job = track_job(&coordinator, 6);

@@ -131,6 +131,9 @@ impl Tracking {
     fn run(&self) -> Result<Tracked, Stop> {
         let window = self.job.window();
         let mut tracked = Tracked::default();
+        if window.is_empty() {
+            return Ok(tracked);
+        }
         let mut load = |place: usize| self.load(self.frame(place)?);
         let mut emit = |place: usize, field: TrackField| {
             let frame = self.frame(place)?;
@@ -172,7 +175,8 @@ impl Tracking {
     /// What tracking goes on from.
     fn state(&self) -> Result<TrackState, Stop> {
         let Some(blob) = &self.job.state else { return Ok(TrackState::default()) };
-        let bytes = self.transfer(|| self.blobs.get(blob))?;
+        // What is gone from the store does not come back: the coordinator leases the window before.
+        let bytes = self.transfer_while(|error| !error.is_lost(), || self.blobs.get(blob))?;
         let view = &self.job.view;
         let decoded = track_state::decode(&bytes);
         Ok(decoded.map_err(|error| {
@@ -231,9 +235,18 @@ impl Tracking {
         &self,
         transfer: impl FnMut() -> F,
     ) -> Result<T, Stop> {
+        self.transfer_while(|_| true, transfer)
+    }
+
+    /// [`Self::transfer`] that gives up at once where `may_pass` says so.
+    fn transfer_while<T, F: Future<Output = Result<T, BlobError>>>(
+        &self,
+        may_pass: impl Fn(&BlobError) -> bool,
+        transfer: impl FnMut() -> F,
+    ) -> Result<T, Stop> {
         let retried = transfer
             .retry(self.backoff)
-            .when(|error| error.kind() == FailureKind::Transient)
+            .when(|error| error.kind() == FailureKind::Transient && may_pass(error))
             .notify(|error, delay| tracing::debug!(%error, ?delay, "a transfer failed and is tried again"));
         let retried = self.cancel.run_until_cancelled(retried);
         let ended = self.runtime.block_on(retried).ok_or(Stop::Cancelled)?;

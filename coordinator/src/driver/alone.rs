@@ -140,6 +140,9 @@ impl OwnTracking {
     /// The state after the window, if it is wanted.
     fn run(&self) -> Result<Option<Blob>, StageError> {
         let (request, settings) = (&self.request, &self.settings.tracking);
+        if request.window().is_empty() {
+            return Ok(None);
+        }
         let is_missing = |place: usize| request.frame_at(place).is_some_and(|frame| frame.tracks.is_none());
         let mut load = |place: usize| self.load(place);
         let mut emit = |place: usize, field: TrackField| self.emit(place, &field);

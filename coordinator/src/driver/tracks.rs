@@ -4,7 +4,7 @@
 //! the images only, so workers begin with them while the static model is made. After that a frame is published as soon as
 //! every view is tracked to it, so that it is refined while later ones are tracked.
 
-use std::{collections::BTreeMap, future::pending, sync::Arc};
+use std::{collections::BTreeMap, future::pending, pin::pin, sync::Arc};
 
 use prost::Message;
 use splat::{formats::track_state, settings::MotionSource, tracking::TrackingSettings};
@@ -23,6 +23,10 @@ use crate::{
     store::ViewRecord,
 };
 
+/// The window that keys of fields name: however views are cut, their fields are the same. A constant, so that the keys stay
+/// whatever the default becomes.
+const KEYED_WINDOW: u32 = 16;
+
 impl Job {
     /// Makes the static model while workers track.
     pub(super) async fn make_static_model_beside_tracks(&mut self) -> Result<(), StageError> {
@@ -31,10 +35,22 @@ impl Job {
         }
         self.offer_tracks().await?;
         let failed = tracks_failed(self.hub.clone(), self.id.clone(), self.changed.clone());
-        tokio::select! {
-            made = self.make_static_model() => made,
-            reason = failed => Err(reason),
-        }
+        let of_model = self.stop.child_token();
+        let of_job = std::mem::replace(&mut self.stop, of_model.clone());
+        let ended = {
+            let mut making = pin!(self.make_static_model());
+            tokio::select! {
+                made = &mut making => made,
+                reason = failed => {
+                    of_model.cancel();
+                    // It works on threads of its own, which end at its next step. That it was stopped is no reason.
+                    let _ = making.await;
+                    Err(reason)
+                }
+            }
+        };
+        self.stop = of_job;
+        ended
     }
 
     pub(super) async fn track(&mut self) -> Result<(), StageError> {
@@ -65,6 +81,11 @@ impl Job {
     /// Views that lack fields become ready for workers, once in a run.
     async fn offer_tracks(&self) -> Result<(), StageError> {
         if self.hub.has_tracks(&self.id).await {
+            // Who watches this stage is told how far it is, though nothing may change for long.
+            let (done, total) = self.hub.tracks(&self.id, TrackLedger::counts).await?;
+            if done < total {
+                self.hub.progress(&self.id, "tracking", done, total);
+            }
             return Ok(());
         }
         let ledger = self.ledger().await?;
@@ -90,9 +111,7 @@ impl Job {
 
     /// What is to be tracked, and what is in the store already.
     pub(super) async fn ledger(&self) -> Result<TrackLedger, StageError> {
-        // However views are cut, their fields are the same.
-        let window = TrackingSettings::default().window;
-        let uncut = TrackingSettings { window, ..self.settings.tracking.clone() };
+        let uncut = TrackingSettings { window: KEYED_WINDOW, ..self.settings.tracking.clone() };
         let settings_json = serde_json::to_string(&uncut).map_err(|error| {
             StageError::new(FailureKind::Bug, format!("the tracker's settings as JSON: {error}"))
         })?;
@@ -160,7 +179,9 @@ impl Job {
             let tracks: Option<Blob> = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
             fields.push(Field { frame, image, key, tracks });
             if index % window == 0 && index < last {
-                let key = digest_of(&("track state", VERSION, &own_key));
+                // Of the job and the view alone: each discards its own.
+                let format = track_state::VERSION;
+                let key = digest_of(&("track state", VERSION, format, &*self.id, position, &own_key));
                 let blob = self.held_artifact(&key).await?.map(|artifact| artifact.blob);
                 states.push(State { key, blob });
             }

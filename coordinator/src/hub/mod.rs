@@ -93,6 +93,8 @@ pub(crate) struct Hub {
     pub(crate) shutdown: CancellationToken,
     /// One job at a time uses the compute pool, so that an earlier job is not slowed down by later ones.
     pub(crate) turn: Semaphore,
+    /// One state of the tracker at a time is read for verification.
+    reading_state: tokio::sync::Mutex<()>,
     /// One submission at a time, so that the same one twice is one job.
     pub(crate) submitting: tokio::sync::Mutex<()>,
     /// One submission of a URL at a time, by the URL's digest, so that no copy changes while another reads it.
@@ -134,6 +136,7 @@ impl Hub {
             engine,
             shutdown,
             turn: Semaphore::new(1),
+            reading_state: tokio::sync::Mutex::new(()),
             submitting: tokio::sync::Mutex::new(()),
             copying: Mutex::default(),
             probe,

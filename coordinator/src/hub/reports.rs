@@ -99,7 +99,14 @@ impl Hub {
     ) -> Result<Option<String>, StoreError> {
         let mut desk = self.desk.lock().await;
         match desk.queue.fail(lease_id, attempt, reason.kind()) {
-            Ok(failed) => self.record_failed(&mut desk, &failed, &reason).await.map(|()| None),
+            Ok(failed) => {
+                let unusable = desk.lose_unusable_state(&failed.lease, reason.kind());
+                self.record_failed(&mut desk, &failed, &reason).await?;
+                let nameless = self.forget_states(unusable.as_slice()).await?;
+                drop(desk);
+                self.remove_blobs(&nameless).await;
+                Ok(None)
+            }
             Err(stale) => Ok(Some(stale.to_string())),
         }
     }

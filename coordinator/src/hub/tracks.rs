@@ -20,19 +20,25 @@ use crate::{
     store::{Artifact, AttemptOutcome, StoreError, TaskEvent, TaskRecord},
 };
 
+/// States lost of a view without a new field from which on every window of it counts as failed: a store that keeps none
+/// would have the view tracked again for ever.
+const MAX_LOST_STATES: u32 = 3;
+
 impl Hub {
     /// What is known of a job's tracks from now on; views that lack fields become ready for workers.
     pub(crate) async fn begin_tracks(
         &self,
         job: &JobId,
         stop: &CancellationToken,
-        ledger: TrackLedger,
+        mut ledger: TrackLedger,
     ) -> Result<(), StageError> {
         let mut desk = self.desk.lock().await;
         if stop.is_cancelled() {
             return Err(StageError::Stopped);
         }
         let positions = ledger.positions();
+        // A coordinator that was killed may have left them behind.
+        let superseded: Vec<State> = positions.iter().flat_map(|&p| ledger.take_superseded(p)).collect();
         let is_missing = |&position: &u32| ledger.missing(position).is_some();
         let (missing, complete): (Vec<u32>, Vec<u32>) = positions.iter().partition(|p| is_missing(p));
         let (done, total) = ledger.counts();
@@ -50,7 +56,11 @@ impl Hub {
         for position in missing {
             self.publish_tracks(&mut desk, job, position).await?;
         }
-        Ok(self.dispatch(&mut desk).await?)
+        let nameless = self.forget_states(&superseded).await?;
+        self.dispatch(&mut desk).await?;
+        drop(desk);
+        self.remove_blobs(&nameless).await;
+        Ok(())
     }
 
     /// Whether views have become ready in this run of the job.
@@ -145,8 +155,12 @@ impl Hub {
         let id = uuid::Uuid::now_v7().simple().to_string();
         let Some(lease) = desk.queue.lease_own(job, Instant::now(), id) else { return Ok(None) };
         self.record_grant(&lease).await?;
-        let request = self.track_job(&mut desk, job, lease.key.task.number()).await?;
-        Ok(request.map(|request| (lease, request)))
+        let position = lease.key.task.number();
+        let request = self.track_job(&mut desk, job, position).await?.ok_or_else(|| {
+            let message = format!("the job has no view {position} to track: a defect of the coordinator");
+            StageError::new(FailureKind::Bug, message)
+        })?;
+        Ok(Some((lease, request)))
     }
 
     /// What whoever leases a view gets.
@@ -240,6 +254,14 @@ impl Hub {
             return self.refused(&lease.id, lease.attempt, reason).await;
         }
         let next = ledger.and_then(|ledger| ledger.missing(position).map(|_| ledger.before(position)));
+        if next.is_some() && ledger.is_some_and(|ledger| ledger.lost_states(position) >= MAX_LOST_STATES) {
+            drop(desk);
+            let message = format!(
+                "the store has lost {MAX_LOST_STATES} of the tracker's states without a new field; check its disk"
+            );
+            let reason = failure(FailureKind::Transient, message);
+            return self.refused(&lease.id, lease.attempt, reason).await;
+        }
         let ended = match next {
             Some(before) => desk.queue.go_on(&lease.id, lease.attempt, before),
             None => desk.queue.commit(&lease.id, lease.attempt),
@@ -254,7 +276,9 @@ impl Hub {
         }
         let ledger = desk.ledger_mut(&lease.key.job);
         let superseded = ledger.map(|ledger| ledger.take_superseded(position));
-        self.discard_states(&superseded.unwrap_or_default()).await?;
+        let nameless = self.forget_states(&superseded.unwrap_or_default()).await?;
+        drop(desk);
+        self.remove_blobs(&nameless).await;
         Ok(None)
     }
 

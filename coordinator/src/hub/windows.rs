@@ -10,7 +10,7 @@ use crate::{
     blobs::{BlobError, name},
     failure::failure,
     ledger::{State, StatePlace},
-    queue::Lease,
+    queue::{Lease, Task},
     store::{Artifact, AttemptOutcome, StoreError},
 };
 
@@ -63,10 +63,13 @@ impl Hub {
         let mut change = self.store.change().await?;
         change.end_attempt(&lease.id, AttemptOutcome::Released(why)).await?;
         change.release_task(&lease.key, lease.attempt, &lease.worker_id).await?;
+        change.remove_artifact(&key).await?;
         change.commit().await?;
-        self.discard_states(&[State { key, blob: Some(blob) }]).await?;
         self.tell_stored(job);
         desk.changed(job);
+        drop(desk);
+        // Whoever else names a damaged blob has no use for it, and it would be taken for one that is there already.
+        self.blobs.remove(&blob).await;
         Ok(None)
     }
 
@@ -92,10 +95,9 @@ impl Hub {
         }
         let artifact = Artifact { blob: blob.clone(), note: String::new() };
         let mut change = self.store.change().await?;
+        // Only fields are progress: a state may be made for the second time.
         change.put_artifact(&key, "track-state", &artifact).await?;
-        change.forget_failures(&lease.key).await?;
         change.commit().await?;
-        desk.queue.progressed(&lease.key);
         if let Some(ledger) = desk.ledger_mut(job) {
             ledger.keep_state(position, blob);
         }
@@ -105,6 +107,8 @@ impl Hub {
     /// The state is what its name says, readable, and of frames that the next window is given.
     async fn verify_state(&self, blob: &Blob, past: Range<usize>) -> Result<(), Failure> {
         let bug = |message: String| failure(FailureKind::Bug, message);
+        // States may be large: one at a time is read, however many workers report.
+        let _turn = self.reading_state.lock().await;
         let bytes = self.fetched(blob, "the tracker's state").await?;
         let decoded = tokio::task::spawn_blocking(move || track_state::decode(&bytes)).await;
         let state = decoded
@@ -120,10 +124,11 @@ impl Hub {
         }
     }
 
-    /// Removes states that nobody goes on from any more. If another job of the same clip does, it begins earlier.
-    pub(super) async fn discard_states(&self, states: &[State]) -> Result<(), StoreError> {
+    /// Forgets states that nobody goes on from any more. Their blobs that nothing names now are to be removed, once the desk
+    /// is free: if a job of the same clip makes one again meanwhile, its window before is repeated.
+    pub(super) async fn forget_states(&self, states: &[State]) -> Result<Vec<Blob>, StoreError> {
         if states.is_empty() {
-            return Ok(());
+            return Ok(Vec::new());
         }
         let mut change = self.store.change().await?;
         for state in states {
@@ -132,11 +137,32 @@ impl Hub {
         change.commit().await?;
         // What remembers nothing is the same blob for every view, and one may be about to be reported.
         let nothing = name(&track_state::encode(&TrackState::default()));
+        let mut nameless = Vec::new();
         for blob in states.iter().filter_map(|state| state.blob.as_ref()).filter(|blob| **blob != nothing) {
             if !self.store.is_artifact(blob).await? {
-                self.blobs.remove(blob).await;
+                nameless.push(blob.clone());
             }
         }
-        Ok(())
+        Ok(nameless)
+    }
+
+    pub(super) async fn remove_blobs(&self, blobs: &[Blob]) {
+        for blob in blobs {
+            self.blobs.remove(blob).await;
+        }
+    }
+}
+
+impl Desk {
+    /// Takes away the state that a failed lease began from if the failure may be the state's own: the next attempt begins
+    /// before it.
+    pub(super) fn lose_unusable_state(&mut self, lease: &Lease, kind: FailureKind) -> Option<State> {
+        let (Task::Tracks(position), FailureKind::Bug) = (lease.key.task, kind) else { return None };
+        let ledger = self.ledger_mut(&lease.key.job)?;
+        let state = ledger.leased_state(position).filter(|state| state.blob.is_some())?;
+        ledger.lose_state(position, &state.key);
+        let before = ledger.before(position);
+        self.queue.reschedule(&lease.key, before);
+        Some(state)
     }
 }

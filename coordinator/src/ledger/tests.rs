@@ -89,6 +89,10 @@ fn a_task_names_what_exists_and_a_failure_its_view() {
 
 /// One view over frames 10, 11, … 16 in windows of two; the key frame is 10.
 fn in_windows(reach: usize) -> TrackLedger {
+    in_windows_of(2, reach)
+}
+
+fn in_windows_of(window: usize, reach: usize) -> TrackLedger {
     let field = |frame: u32| Field {
         frame,
         image: blob(&format!("image-{frame}")),
@@ -100,8 +104,10 @@ fn in_windows(reach: usize) -> TrackLedger {
         size: (8, 6),
         key_image: blob("image-10"),
         fields: (11..=16).map(field).collect(),
-        window: 2,
-        states: (0..2).map(|number| State { key: format!("state-{number}"), blob: None }).collect(),
+        window,
+        states: (0..6_usize.div_ceil(window) - 1)
+            .map(|number| State { key: format!("state-{number}"), blob: None })
+            .collect(),
     };
     TrackLedger::new("job".into(), 10, Tracker::default(), reach, [(0, view)].into())
 }
@@ -139,15 +145,58 @@ fn windows_follow_each_other_by_their_states() {
     assert_eq!(ledger.state_place(0).unwrap().past, 2..5);
     assert_eq!(ledger.take_superseded(0), [], "it is begun from");
     keep_leased(&mut ledger, &second, Some("b"));
-    let superseded = ledger.take_superseded(0);
-    assert_eq!(superseded, [State { key: "state-0".into(), blob: Some(blob("a")) }]);
+    assert_eq!(ledger.take_superseded(0), [], "the last but one is gone back to where the last is lost");
 
     let last = ledger.lease(0).unwrap();
     assert_eq!((numbers(&last.frames), numbers(&last.past)), (vec![10, 15, 16], vec![12, 13, 14]));
     assert_eq!((last.state.clone(), last.wants_state, ledger.before(0)), (Some(blob("b")), false, 13));
     keep_leased(&mut ledger, &last, None);
-    assert_eq!((ledger.lacks(0), ledger.missing(0), ledger.lease(0)), (None, None, None));
-    assert_eq!(ledger.take_superseded(0).len(), 1);
+    assert_eq!((ledger.lacks(0), ledger.missing(0)), (None, None));
+    let kept = |number: usize, name: &str| State { key: format!("state-{number}"), blob: Some(blob(name)) };
+    assert_eq!(ledger.take_superseded(0), [kept(0, "a"), kept(1, "b")]);
+}
+
+#[test]
+fn the_last_two_states_are_kept() {
+    let mut ledger = in_windows_of(1, 1);
+    let mut superseded = Vec::new();
+    for state in ["a", "b", "c", "d"] {
+        let job = ledger.lease(0).unwrap();
+        keep_leased(&mut ledger, &job, Some(state));
+        superseded.push(ledger.take_superseded(0).into_iter().map(|state| state.key).collect::<Vec<_>>());
+    }
+    assert_eq!(superseded, [vec![], vec![], vec!["state-0".to_owned()], vec!["state-1".to_owned()]]);
+    ledger.lose_state(0, "state-3");
+    let again = ledger.lease(0).unwrap();
+    assert_eq!((again.first, again.state.clone()), (4, Some(blob("c"))), "one window is repeated");
+}
+
+#[test]
+fn a_view_that_lacks_its_report_only_is_leased_with_an_empty_window() {
+    let mut ledger = in_windows(1);
+    for state in [Some("a"), Some("b"), None] {
+        let job = ledger.lease(0).unwrap();
+        keep_leased(&mut ledger, &job, state);
+    }
+    let job = ledger.lease(0).unwrap();
+    assert_eq!((numbers(&job.frames), job.window().len(), job.past.len()), (vec![10], 0, 0));
+    assert_eq!((job.state, job.wants_state), (None, false));
+    assert_eq!((ledger.lacks(0), ledger.state_place(0), ledger.leased_state(0)), (None, None, None));
+}
+
+#[test]
+fn lost_states_are_counted_until_a_field_comes() {
+    let mut ledger = in_windows(1);
+    let job = ledger.lease(0).unwrap();
+    for _ in 0..2 {
+        keep_leased(&mut ledger, &job, Some("a"));
+        ledger.lose_state(0, "state-0");
+        ledger.lose_state(0, "state-0");
+        ledger.lease(0).unwrap();
+    }
+    assert_eq!(ledger.lost_states(0), 2, "the same loss counts once");
+    ledger.keep(0, &found(13, "field"));
+    assert_eq!(ledger.lost_states(0), 0);
 }
 
 #[test]

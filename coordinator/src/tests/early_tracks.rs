@@ -163,6 +163,8 @@ async fn a_view_that_cannot_be_tracked_fails_the_job_before_its_static_model_is_
     let job = bench.submit(gated.request()).await.unwrap().job_id;
     let lease = worker.lease().await;
     assert!(worker.fail(&lease, FailureKind::BadInput).await.accepted);
+    // The model's threads end at their next step, and the run with them.
+    gated.gate.let_through(1);
     let (state, failure) = bench.ended(&job).await;
     let failure = failure.unwrap();
     assert_eq!((state, failure.kind()), (JobState::Failed, FailureKind::BadInput));

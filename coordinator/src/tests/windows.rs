@@ -166,6 +166,15 @@ async fn views_take_turns_and_frames_are_done_while_later_windows_wait() {
     }
 }
 
+fn state_file(bench: &Bench, view: &str, place: usize) -> std::path::PathBuf {
+    let digest = crate::blobs::name(&state_of(view, place)).digest;
+    bench.options.root.join("blobs").join(&digest[..2]).join(&digest)
+}
+
+fn remove_state(bench: &Bench, view: &str, place: usize) {
+    std::fs::remove_file(state_file(bench, view, place)).unwrap();
+}
+
 /// Waits until a frame is published, unless it was waited for before.
 async fn watch_frame(watch: &mut Watch, frame: u32, order: &[String]) {
     if matches!((frame, order.len()), (3, 0) | (5, 4) | (7, 9)) {
@@ -202,6 +211,53 @@ async fn a_worker_that_dies_in_a_window_costs_the_window() {
     assert_eq!(rest.len(), 5, "{rest:?}");
 }
 
+/// A job whose first view has all its fields, while `w` has not reported yet.
+async fn before_the_last_report(bench: &Bench) -> (Worker, String, Lease) {
+    let mut worker = bench.worker("w").await;
+    let job = bench.submit(request(bench, 16)).await.unwrap().job_id;
+    let lease = worker.window(bench).await;
+    for frame in 2..=7 {
+        let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
+        let report = FieldReport { lease_id, attempt, field: Some(field(bench, frame).await) };
+        worker.send(worker_message::Message::Field(report)).await;
+    }
+    loop {
+        let counts = bench.hub().tracks(&job.as_str().into(), |ledger| ledger.counts()).await.unwrap();
+        if counts.0 == 6 {
+            return (worker, job, lease);
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+}
+
+#[tokio::test]
+async fn who_is_lost_between_the_last_field_and_the_report_leaves_an_heir_an_empty_window() {
+    let bench = bench().await;
+    let (lost, job, lease) = before_the_last_report(&bench).await;
+    let mut heir = bench.worker("heir").await;
+    drop(lost);
+    let is_lost = |event: &Event| matches!(event, Event::TracksState(t) if t.failure.is_some());
+    bench.watch(&job, 0).await.until(is_lost).await;
+    let again = heir.window(&bench).await;
+    assert_eq!(leased(&again), (leased(&lease).0, vec![]));
+    let request = track_job(&again);
+    assert_eq!((request.state, request.wants_state, request.frames.len()), (None, false, 1));
+    heir.finish(&bench, &again).await;
+    let rest = heir.finish_job(&bench, &job).await;
+    assert_eq!(rest.len(), 2, "{rest:?}");
+}
+
+#[tokio::test]
+async fn who_is_lost_between_the_last_field_and_the_report_leaves_the_coordinator_nothing_to_track() {
+    let bench = bench().await;
+    let (lost, job, _) = before_the_last_report(&bench).await;
+    drop(lost);
+    let tracked = |event: &Event| matches!(event, Event::JobState(j) if j.state() == JobState::Frames);
+    bench.watch(&job, 0).await.until(tracked).await;
+    let rest = bench.worker("late").await.finish_job(&bench, &job).await;
+    assert!(rest.is_empty(), "{rest:?}");
+}
+
 #[tokio::test]
 async fn a_restarted_coordinator_goes_on_at_the_end_of_the_last_window() {
     let mut bench = bench().await;
@@ -218,10 +274,7 @@ async fn a_restarted_coordinator_goes_on_at_the_end_of_the_last_window() {
 async fn a_state_that_is_gone_or_damaged_costs_the_window_before_it_and_no_attempt() {
     let bench = bench().await;
     let (mut worker, job) = after_first_windows(&bench).await;
-    let file = |view: &str| {
-        let digest = crate::blobs::name(&state_of(view, 2)).digest;
-        bench.options.root.join("blobs").join(&digest[..2]).join(&digest)
-    };
+    let file = |view: &str| state_file(&bench, view, 2);
     std::fs::remove_file(file("cam00")).unwrap();
     let lease = worker.window(&bench).await;
     let request = track_job(&lease);
@@ -244,6 +297,128 @@ async fn a_state_that_is_gone_or_damaged_costs_the_window_before_it_and_no_attem
     worker.finish(&bench, &lease).await;
     let rest = worker.finish_job(&bench, &job).await;
     assert_eq!(rest.len(), 5, "{rest:?}");
+}
+
+#[tokio::test]
+async fn a_state_that_is_gone_in_the_third_window_costs_the_second_only() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    for _ in 0..3 {
+        let lease = worker.window(&bench).await;
+        worker.finish(&bench, &lease).await;
+    }
+    remove_state(&bench, "cam00", 4);
+    let lease = worker.window(&bench).await;
+    let request = track_job(&lease);
+    assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
+    assert_eq!(request.state, Some(crate::blobs::name(&state_of("cam00", 2))));
+    worker.finish(&bench, &lease).await;
+    let rest = worker.finish_job(&bench, &job).await;
+    assert_eq!(rest.len(), 3, "{rest:?}");
+}
+
+#[tokio::test]
+async fn jobs_of_one_clip_keep_their_states_apart() {
+    let bench = bench().await;
+    let first = bench.submit(request(&bench, 2)).await.unwrap().job_id;
+    let mut held = Vec::new();
+    for (name, view) in [("a", "cam00"), ("b", "cam01"), ("c", "cam02")] {
+        let mut worker = bench.worker(name).await;
+        let lease = worker.window(&bench).await;
+        assert_eq!(leased(&lease).0, view);
+        held.push((worker, lease));
+    }
+    let again = SubmitRequest { output: bench.path("again"), ..request(&bench, 2) };
+    let second = bench.submit(again).await.unwrap().job_id;
+    let mut other = bench.worker("d").await;
+    let lease = other.window(&bench).await;
+    assert_eq!((track_job(&lease).job_id, leased(&lease).0), (second.clone(), "cam00".into()));
+    other.finish(&bench, &lease).await;
+
+    let (worker, lease) = &mut held[0];
+    worker.finish(&bench, lease).await;
+    for frames in [[4, 5], [6, 7]] {
+        let lease = worker.window(&bench).await;
+        assert_eq!(
+            (track_job(&lease).job_id, leased(&lease)),
+            (first.clone(), ("cam00".into(), frames.into()))
+        );
+        worker.finish(&bench, &lease).await;
+    }
+    let of_second = |ledger: &crate::ledger::TrackLedger| ledger.next_state(0);
+    let state = bench.hub().tracks(&second.as_str().into(), of_second).await.unwrap().unwrap();
+    let blob = state.blob.unwrap();
+    assert_eq!(blob, crate::blobs::name(&state_of("cam00", 2)));
+    assert!(bench.hub().blobs.holds(&blob).await, "the first job has discarded its own only");
+    assert!(bench.hub().store.artifact(&state.key).await.unwrap().is_some());
+}
+
+#[tokio::test]
+async fn a_state_that_cannot_be_gone_on_from_is_made_again_and_the_failure_counts() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let key = TaskKey { job: job.as_str().into(), task: Task::Tracks(0) };
+    for failures in 1..=3 {
+        let lease = worker.window(&bench).await;
+        assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
+        assert!(worker.fail(&lease, FailureKind::Bug).await.accepted);
+        let record = bench.hub().store.task(&key).await.unwrap().unwrap();
+        assert_eq!(record.failures, failures, "a state that is made again is no progress");
+        if failures < 3 {
+            let lease = worker.window(&bench).await;
+            assert_eq!((leased(&lease), track_job(&lease).state), (("cam00".into(), vec![2, 3]), None));
+            worker.finish(&bench, &lease).await;
+        }
+    }
+    let (state, failure) = bench.ended(&job).await;
+    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Bug));
+    assert!(!state_file(&bench, "cam00", 2).exists(), "a resubmission begins before it");
+}
+
+#[tokio::test]
+async fn a_store_that_keeps_no_state_fails_the_job() {
+    let bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let mut refused = Vec::new();
+    for _ in 0..5 {
+        remove_state(&bench, "cam00", 2);
+        let lease = worker.window(&bench).await;
+        assert_eq!(leased(&lease), ("cam00".into(), vec![2, 3]));
+        let tracked = window(&bench, &lease).await;
+        let receipt = worker.report(&lease, Outcome::Tracked(tracked)).await;
+        refused.push((!receipt.accepted).then_some(receipt.reason));
+    }
+    assert!(refused[..2].iter().all(Option::is_none), "{refused:?}");
+    assert!(refused[2..].iter().flatten().all(|reason| reason.contains("check its disk")), "{refused:?}");
+    let (state, failure) = bench.ended(&job).await;
+    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Transient));
+}
+
+#[tokio::test]
+async fn states_that_a_killed_coordinator_left_behind_are_removed() {
+    let mut bench = bench().await;
+    let (mut worker, job) = after_first_windows(&bench).await;
+    let id: crate::queue::JobId = job.as_str().into();
+    let first = bench.hub().tracks(&id, |ledger| ledger.next_state(0)).await.unwrap().unwrap();
+    let windows = worker.finish_job(&bench, &job).await;
+    assert_eq!(windows.len(), 6);
+    bench.stop().await;
+    // As it is left between the report that completes a view and the removal of its states.
+    let blob = first.blob.unwrap();
+    let store = crate::store::Store::open(&bench.options.root.join("state.sqlite")).await.unwrap();
+    let mut change = store.change().await.unwrap();
+    let artifact = crate::store::Artifact { blob: blob.clone(), note: String::new() };
+    change.put_artifact(&first.key, "track-state", &artifact).await.unwrap();
+    change.commit().await.unwrap();
+    store.close().await;
+    let file = state_file(&bench, "cam00", 2);
+    std::fs::write(&file, state_of("cam00", 2)).unwrap();
+    std::fs::remove_dir_all(bench.path("out")).unwrap();
+    bench.restart().await;
+    assert!(bench.submit(request(&bench, 2)).await.unwrap().resumed);
+    let mut worker = bench.worker("w").await;
+    assert!(worker.finish_job(&bench, &job).await.is_empty());
+    assert!(!file.exists() && bench.hub().store.artifact(&first.key).await.unwrap().is_none());
 }
 
 #[tokio::test]

@@ -9,7 +9,8 @@ use super::{
 use crate::tracking::state::{PLANES, Remembered, TrackState};
 
 const MAGIC: &[u8; 7] = b"TSSTATE";
-const VERSION: u8 = 1;
+/// Version of the format.
+pub const VERSION: u8 = 1;
 /// Width, height, number of frames.
 const HEADER: usize = 4 + 4 + 4;
 
