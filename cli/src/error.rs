@@ -12,7 +12,7 @@ pub(crate) const EXIT_CODES: &str = "Exit codes:
   1    the job, the coordinator or a worker failed
   2    wrong usage of the command line
   3    bad input: a clip, file, setting or folder that cannot be used
-  130  interrupted by Ctrl-C or SIGTERM; the same command resumes";
+  130  interrupted by Ctrl-C or SIGTERM; reconstruct goes on where it was when run again";
 
 /// Why a command failed.
 #[derive(Debug, Error)]

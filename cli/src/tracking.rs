@@ -12,6 +12,7 @@ use splat::{
         learned::{LearnedError, MAX_MODEL_BYTES},
     },
 };
+use tokio_util::sync::CancellationToken;
 
 use crate::{
     args::{QualityArg, TrackerArg},
@@ -134,12 +135,13 @@ impl<F: Fn(usize) -> Result<Arc<Image>, CliError>> KeepsLast<F> {
 #[derive(Debug)]
 pub(crate) struct ChosenViews {
     opened: OpenedClip,
+    interrupted: CancellationToken,
     /// Positions among the clip's views.
     pub(crate) positions: Vec<usize>,
 }
 
 impl ChosenViews {
-    pub(crate) fn open(args: &ViewsArgs) -> Result<Self, CliError> {
+    pub(crate) fn open(args: &ViewsArgs, interrupted: CancellationToken) -> Result<Self, CliError> {
         let options = ClipOptions {
             frames: args.frames.map(|range| (range.first, range.last)),
             // Every image is looked at while it is the latest, which `KeepsLast` holds.
@@ -153,11 +155,21 @@ impl ChosenViews {
             let why = format!("tracks need two frames, there are {}", opened.clip.frames().len());
             return Err(CliError::bad_input(args.clip.display(), format!("{why}; --frames takes more")));
         }
-        Ok(Self { opened, positions })
+        Ok(Self { opened, interrupted, positions })
     }
 
     pub(crate) fn clip(&self) -> &Clip {
         &self.opened.clip
+    }
+
+    /// Refuses to go on once Ctrl-C was pressed.
+    pub(crate) fn go_on(&self) -> Result<(), CliError> {
+        if self.interrupted.is_cancelled() {
+            return Err(CliError::Interrupted(
+                "interrupted; nothing is kept of what was unfinished".to_owned(),
+            ));
+        }
+        Ok(())
     }
 
     pub(crate) fn name(&self, position: usize) -> &str {
@@ -176,7 +188,10 @@ impl ChosenViews {
         let images = KeepsLast::new(|index| {
             clip.image(position, index).map_err(|error| CliError::BadInput(error.to_string()))
         });
-        let mut load = |index: usize| Ok::<_, Stop>(images.get(index)?);
+        let mut load = |index: usize| {
+            self.go_on()?;
+            Ok::<_, Stop>(images.get(index)?)
+        };
         // A tracker gives the field of a frame before it asks for the next image.
         let mut emit = |index: usize, field: TrackField| {
             let image = images.get(index)?;

@@ -89,7 +89,7 @@ impl Settings {
 
 /// Ranges of settings, checked wherever settings are read.
 pub(crate) mod range {
-    use std::fmt::Display;
+    use std::{collections::BTreeSet, fmt::Display};
 
     use serde::{Deserialize, Deserializer, de::Error};
 
@@ -132,13 +132,17 @@ pub(crate) mod range {
         between(f32::deserialize(from)?, 0.0, 1e6)
     }
 
-    /// Distances between frames: up to 16, each 1 to 1000.
+    /// Distances between frames: up to 16, each 1 to 1000, none twice. A chain given twice would vote twice.
     pub(crate) fn gaps<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<u32>, D::Error> {
         let gaps = Vec::<u32>::deserialize(from)?;
-        if gaps.len() <= 16 && gaps.iter().all(|gap| (1..=1000).contains(gap)) {
+        let distinct: BTreeSet<u32> = gaps.iter().copied().collect();
+        if gaps.len() <= 16 && distinct.len() == gaps.len() && gaps.iter().all(|gap| (1..=1000).contains(gap))
+        {
             return Ok(gaps);
         }
-        Err(D::Error::custom(format!("{gaps:?} are not up to 16 distances between 1 and 1000 frames")))
+        Err(D::Error::custom(format!(
+            "{gaps:?} are not up to 16 different distances between 1 and 1000 frames"
+        )))
     }
 
     /// A share in double precision: 0 to 1.

@@ -99,6 +99,14 @@ impl Running {
         self.child.id()
     }
 
+    /// Whether it has not ended.
+    ///
+    /// # Panics
+    /// If the process cannot be asked.
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().expect("a child can be asked").is_none()
+    }
+
     /// Everything said so far.
     pub fn log(&self) -> String {
         self.lines.lock().expect("no reader panics").join("\n")
@@ -121,8 +129,7 @@ impl Running {
             if let Some(line) = found {
                 return line;
             }
-            let ended = self.child.try_wait().expect("a child can be asked").is_some();
-            assert!(!ended && start.elapsed() < PATIENCE, "never said {parts:?}:\n{}", self.log());
+            assert!(self.is_running() && start.elapsed() < PATIENCE, "never said {parts:?}:\n{}", self.log());
             std::thread::sleep(Duration::from_millis(20));
         }
     }

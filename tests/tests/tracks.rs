@@ -1,16 +1,20 @@
 //! `track` and `eval-tracks` as commands.
 #![allow(clippy::unwrap_used, reason = "tests")]
 
-use std::path::Path;
+use std::{path::Path, time::Duration};
 
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
 use serde_json::Value;
 use trackersplat_tests::{clips, program};
 
 /// The cheapest tracks: what is said of them matters here, not how good they are.
-const QUICK: [&str; 4] = ["--quality", "draft", "--set", "tracking.max_side=160"];
+const QUICK: [&str; 2] = ["--quality", "draft"];
 
 /// The images as they are: standard deviations are smallest where nothing is scaled.
-const WHOLE: [&str; 2] = ["--quality", "draft"];
+const WHOLE: [&str; 4] = ["--quality", "draft", "--set", "tracking.max_side=800"];
 
 fn text(path: &Path) -> &str {
     path.to_str().unwrap()
@@ -62,6 +66,12 @@ fn tracks_are_written_pictured_and_measure_the_same_from_the_file() {
     let moving = &own["pixels"]["moving"]["endpoint"];
     // Objects of the clip move by 40 px and more.
     assert!(moving["pixels"].as_u64().unwrap() > 1000 && moving["median"].as_f64().unwrap() < 2.0, "{own}");
+    // What rests, rests; and standard deviations mean what they say (those of `balanced` are within 10 points of a Gaussian's).
+    let all = &own["pixels"]["all"];
+    let within = [0, 1].map(|sigmas| all["within"][sigmas].as_f64().unwrap());
+    assert!((0.5..0.8).contains(&within[0]) && (0.8..0.99).contains(&within[1]), "{within:?}");
+    let (median, iou) = (&all["endpoint"]["median"], &all["visibility"]["iou"]);
+    assert!(median.as_f64().unwrap() < 0.1 && iou.as_f64().unwrap() > 0.9, "{median} px, {iou}");
     let deciles = own["pixels"]["all"]["deciles"].as_array().unwrap();
     assert_eq!(deciles.len(), 10);
     // Small enough that any floor of what is read would show.
@@ -118,4 +128,23 @@ fn wrong_input_names_what_is_wrong_and_the_remedy() {
     is_refused(&["eval-tracks", clip, "--views", "cam00", "--tracks", text(&file)], &["one.npz"]);
     let (code, said) = program::run(["eval-tracks", clip, "--tracks", text(&file), "--quality", "best"]);
     assert_eq!(code, 2, "{said}");
+}
+
+#[test]
+fn ctrl_c_ends_it_and_leaves_nothing_half_written() {
+    let out = tempfile::tempdir().unwrap();
+    let clip = program::demo_clip();
+    // Slow enough that it cannot end before the signal comes.
+    let line =
+        ["track", text(&clip), "--out", text(out.path()), "--views", "cam00,cam01", "--quality", "best"];
+    let mut run = program::start(line);
+    let files = || std::fs::read_dir(out.path()).unwrap().count();
+    while files() == 0 {
+        assert!(run.is_running(), "{}", run.log());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    kill(Pid::from_raw(run.id() as i32), Signal::SIGINT).unwrap();
+    assert_eq!(run.wait().code(), Some(130), "{}", run.log());
+    assert!(run.log().contains("error: interrupted"), "{}", run.log());
+    assert_eq!(files(), 0);
 }

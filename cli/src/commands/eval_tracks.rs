@@ -13,6 +13,7 @@ use splat::{
     },
     tracking::{TrackField, Tracker, TrackingSettings},
 };
+use tokio_util::sync::CancellationToken;
 
 use super::{print_json, track::progress};
 use crate::{
@@ -84,10 +85,14 @@ struct Mean {
     mean: Option<f64>,
 }
 
-pub(super) fn run(args: EvalTracksArgs, logs: &LogArgs) -> Result<(), CliError> {
+pub(super) fn run(
+    args: &EvalTracksArgs,
+    logs: &LogArgs,
+    interrupted: CancellationToken,
+) -> Result<(), CliError> {
     let settings = args.tracker.settings()?;
     let tracker = args.tracker.load(&settings)?;
-    let views = ChosenViews::open(&args.views)?;
+    let views = ChosenViews::open(&args.views, interrupted)?;
     if views.clip().frames()[0] != 1 {
         let why = format!("exact flow starts at frame 1, not at {}", views.clip().frames()[0]);
         return Err(CliError::bad_input("--frames", format!("{why}; begin with frame 1")));
@@ -214,6 +219,7 @@ impl ViewScores {
             }
             TrackSource::File(file) => {
                 for (index, field) in (1..).zip(open_tracks(views, position, file)?.fields()) {
+                    views.go_on()?;
                     take(index, field)?;
                 }
             }

@@ -17,9 +17,11 @@ mod watch;
 mod worker;
 
 use clap::{Parser, Subcommand};
+use tokio_util::sync::CancellationToken;
 
 use crate::{
     error::{CliError, EXIT_CODES},
+    interrupt,
     logs::LogArgs,
     stdout,
 };
@@ -85,8 +87,8 @@ pub(crate) fn run(cli: Cli) -> Result<(), CliError> {
     match command {
         Command::Eval(args) => eval::run(args),
         Command::Render(args) => render::run(args),
-        Command::Track(args) => track::run(args, &logs),
-        Command::EvalTracks(args) => eval_tracks::run(args, &logs),
+        Command::Track(args) => compute(move |interrupted| track::run(&args, &logs, interrupted)),
+        Command::EvalTracks(args) => compute(move |interrupted| eval_tracks::run(&args, &logs, interrupted)),
         Command::Inspect(args) => inspect::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Reconstruct(args) => wait(reconstruct::run(args, &logs)),
@@ -110,6 +112,17 @@ fn wait(command: impl Future<Output = Result<(), CliError>>) -> Result<(), CliEr
     let ended = runtime.block_on(command);
     runtime.shutdown_background();
     ended
+}
+
+/// Runs a computation that looks between its steps whether it is interrupted, so that it can clear up.
+fn compute(
+    work: impl FnOnce(CancellationToken) -> Result<(), CliError> + Send + 'static,
+) -> Result<(), CliError> {
+    wait(async {
+        let interrupted = interrupt::token()?;
+        let ended = tokio::task::spawn_blocking(|| work(interrupted)).await;
+        ended.map_err(|error| CliError::failed("the computation broke off", error))?
+    })
 }
 
 /// Prints a value for scripts.

@@ -6,10 +6,12 @@ use clap::Args;
 use indicatif::ProgressBar;
 use rayon::prelude::*;
 use splat::{
+    clip::file_stem,
     formats::track_npz::TrackNpzWriter,
     image::Image,
     tracking::{TrackField, Tracker, TrackingSettings},
 };
+use tokio_util::sync::CancellationToken;
 
 use crate::{
     error::CliError,
@@ -35,15 +37,15 @@ pub(crate) struct TrackArgs {
     out: PathBuf,
 
     /// Folder for pictures of every frame: <view>/flow_0002.png (direction as hue), tracks_0002.png (a sparse grid of
-    /// tracks over the frame), uncertainty_0002.png (standard deviation, 0.05 to 16 px from dark to bright).
+    /// tracks over the frame), uncertainty_0002.png (standard deviation, 0.008 to 16 px from dark to bright).
     #[arg(long, value_name = "DIR", help_heading = "Output")]
     pictures: Option<PathBuf>,
 }
 
-pub(super) fn run(args: TrackArgs, logs: &LogArgs) -> Result<(), CliError> {
+pub(super) fn run(args: &TrackArgs, logs: &LogArgs, interrupted: CancellationToken) -> Result<(), CliError> {
     let settings = args.tracker.settings()?;
     let tracker = args.tracker.load(&settings)?;
-    let views = ChosenViews::open(&args.views)?;
+    let views = ChosenViews::open(&args.views, interrupted)?;
     let files = files(&args.out, &views)?;
     let later_frames = views.clip().frames().len() - 1;
     let bar = progress(logs, later_frames * views.positions.len());
@@ -80,7 +82,8 @@ fn files(out: &Path, views: &ChosenViews) -> Result<Vec<PathBuf>, CliError> {
     std::fs::create_dir_all(out).map_err(|error| {
         CliError::bad_input(out.display(), format!("{error}; --out names a folder that can be made"))
     })?;
-    Ok(views.positions.iter().map(|&position| out.join(format!("{}.npz", views.name(position)))).collect())
+    let file = |&position: &usize| out.join(format!("{}.npz", file_stem(views.name(position))));
+    Ok(views.positions.iter().map(file).collect())
 }
 
 /// One view that is tracked.
@@ -96,9 +99,14 @@ impl ViewRun<'_> {
     fn write(&self, file: &Path, bar: &ProgressBar) -> Result<(), CliError> {
         let clip = self.views.clip();
         let camera = &clip.views()[self.position].camera;
-        let failed = |error| CliError::bad_input(file.display(), error);
+        let failed =
+            |error| CliError::failed(file.display(), format!("{error}; run again with room to write"));
         let frames = clip.frames().len();
-        let mut writer = TrackNpzWriter::create(file, frames, camera.width, camera.height).map_err(failed)?;
+        let mut writer =
+            TrackNpzWriter::create(file, frames, camera.width, camera.height).map_err(|error| {
+                let why = format!("{error}; --out names a file or folder that can be written");
+                CliError::bad_input(file.display(), why)
+            })?;
         let mut album = match self.pictures {
             Some(folder) => Some((
                 PictureFolder::create(folder, self.views.name(self.position))?,

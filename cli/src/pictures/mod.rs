@@ -5,14 +5,14 @@ mod trails;
 
 use std::path::{Path, PathBuf};
 
-use splat::{image::Image, tracking::TrackField};
+use splat::{clip::file_stem, image::Image, tracking::TrackField};
 
 pub(crate) use trails::Trails;
 
 use crate::error::CliError;
 
 /// Standard deviations at the ends of the heat map, pixels; between them it is logarithmic.
-const HEAT_RANGE: [f32; 2] = [0.05, 16.0];
+const HEAT_RANGE: [f32; 2] = [0.008, 16.0];
 /// Error that is white, pixels.
 const WHITE_ERROR: f32 = 4.0;
 
@@ -24,7 +24,7 @@ pub(crate) struct PictureFolder {
 impl PictureFolder {
     /// Makes the folder of a view.
     pub(crate) fn create(pictures: &Path, view: &str) -> Result<Self, CliError> {
-        let folder = pictures.join(view);
+        let folder = pictures.join(file_stem(view));
         std::fs::create_dir_all(&folder).map_err(|error| {
             CliError::bad_input(
                 folder.display(),
@@ -37,8 +37,9 @@ impl PictureFolder {
     /// Writes one picture.
     pub(crate) fn write(&self, kind: &str, frame: u32, picture: &Image) -> Result<(), CliError> {
         let path = self.folder.join(format!("{kind}_{frame:04}.png"));
-        std::fs::write(&path, picture.encode_png())
-            .map_err(|error| CliError::bad_input(path.display(), error))
+        std::fs::write(&path, picture.encode_png()).map_err(|error| {
+            CliError::failed(path.display(), format!("{error}; run again with room to write"))
+        })
     }
 }
 
@@ -60,7 +61,7 @@ pub(crate) fn flow(field: &TrackField) -> Image {
     })
 }
 
-/// Standard deviations from dark (0.05 px) to bright (16 px) on a logarithmic scale. Hidden pixels are half as bright.
+/// Standard deviations from dark (0.008 px) to bright (16 px) on a logarithmic scale. Hidden pixels are half as bright.
 pub(crate) fn uncertainty(field: &TrackField) -> Image {
     let [low, high] = HEAT_RANGE.map(f32::ln);
     drawn(field, |i| {
@@ -136,7 +137,11 @@ mod tests {
         let sum = |visible: bool, sigma: f32| {
             uncertainty(&field(&[[0.0; 2]], visible, sigma)).pixels.iter().sum::<f32>()
         };
-        assert!(sum(true, 0.05) < sum(true, 0.5) && sum(true, 0.5) < sum(true, 16.0));
+        assert!(
+            sum(true, 0.01) < sum(true, 0.02)
+                && sum(true, 0.02) < sum(true, 0.5)
+                && sum(true, 0.5) < sum(true, 16.0)
+        );
         assert_eq!(sum(true, 16.0), sum(true, 1e6));
         assert_eq!(2.0 * sum(false, 1.0), sum(true, 1.0));
     }

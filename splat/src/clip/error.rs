@@ -156,6 +156,28 @@ pub enum ClipError {
         /// Number of images.
         images: usize,
     },
+    /// A name that files cannot have.
+    #[error(
+        "{path}: view '{view}' has a name that no file can be given; use letters, digits and the like, folders apart by '/'"
+    )]
+    ViewName {
+        /// The file.
+        path: PathBuf,
+        /// The view.
+        view: String,
+    },
+    /// Two views whose files would have one name.
+    #[error("{path}: files of the views {first} and {second} would both be named {file}; rename one of them")]
+    SameFiles {
+        /// The file that names the second view.
+        path: PathBuf,
+        /// One view.
+        first: String,
+        /// The other.
+        second: String,
+        /// Name of the files, without an ending.
+        file: String,
+    },
     /// Two cameras of one name.
     #[error("{path}: view {view} is given twice; give every camera its own name")]
     DuplicateView {

@@ -76,12 +76,18 @@ pub enum Split {
 /// A static camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// Unique in the clip.
+    /// Unique in the clip: the camera's name, or the folder of its images, with `/` between nested ones.
     pub name: String,
     /// Pinhole camera that holds for the undistorted images of every frame.
     pub camera: Camera,
     /// What the view is for.
     pub split: Split,
+}
+
+/// Name of a view's files, without an ending: the view's name with `_` for `/`. Unique in a clip that was opened, and a
+/// single part of a path.
+pub fn file_stem(view: &str) -> String {
+    view.replace('/', "_")
 }
 
 /// How a clip is opened.

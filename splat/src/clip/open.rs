@@ -1,7 +1,7 @@
 //! From what a reader found to a clip that can be read: the checks that need no image decoded.
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     path::{Path, PathBuf},
     sync::{Arc, OnceLock},
 };
@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use super::{
     ClipError, ClipOptions, Split, View, colmap,
     decode::image_size,
+    file_stem,
     found::{Found, FoundView},
     frame_files::stem_of,
     llff, transforms,
@@ -78,7 +79,9 @@ pub(super) fn check(
     options: &ClipOptions,
 ) -> Result<Opened, ClipError> {
     found.sort_by(|a, b| a.name.cmp(&b.name));
+    found.iter().try_for_each(check_name)?;
     refuse_duplicates(&found)?;
+    refuse_same_files(&found)?;
     hold_out(&mut found, &options.test_views)?;
     found.iter().try_for_each(check_camera)?;
     let training = found.iter().filter(|view| view.split == Split::Train).count();
@@ -91,6 +94,30 @@ pub(super) fn check(
     let views =
         found.into_iter().map(|view| View { name: view.name, camera: view.camera, split: view.split });
     Ok(Opened { views: views.collect(), sources, frames })
+}
+
+/// Names become parts of paths: those that lead elsewhere are refused.
+fn check_name(view: &FoundView) -> Result<(), ClipError> {
+    let is_file_name = |part: &str| {
+        !matches!(part, "" | "." | "..")
+            && !part.contains(|letter: char| letter == '\\' || letter.is_control())
+    };
+    if view.name.split('/').all(is_file_name) {
+        return Ok(());
+    }
+    Err(ClipError::ViewName { path: view.declared_in.clone(), view: view.name.escape_debug().to_string() })
+}
+
+fn refuse_same_files(views: &[FoundView]) -> Result<(), ClipError> {
+    let mut known = BTreeMap::new();
+    for view in views {
+        let file = file_stem(&view.name);
+        if let Some(first) = known.insert(file.clone(), &view.name) {
+            let (path, first, second) = (view.declared_in.clone(), first.clone(), view.name.clone());
+            return Err(ClipError::SameFiles { path, first, second, file });
+        }
+    }
+    Ok(())
 }
 
 fn refuse_duplicates(sorted: &[FoundView]) -> Result<(), ClipError> {

@@ -51,6 +51,9 @@ pub const DEFAULT_SIGMA: f32 = 0.5;
 /// Deflate, which numpy packs with, makes nothing smaller than by this.
 const DEFLATE_RATIO: u64 = 1032;
 
+/// Longest header of an array, bytes: ten times what numpy itself reads without being told to.
+const MAX_HEADER: u32 = 100_000;
+
 /// Steps per pixel of exact flow.
 const FLOW_STEPS: f32 = 64.0;
 
@@ -287,7 +290,13 @@ impl<'a> Archive<'a> {
             .map_err(|error| problem(error.to_string()))?;
         // What the entry says about its size it may say wrongly.
         let size = entry.size().min(self.unpacked);
-        let reader: &mut dyn Read = &mut entry;
+        let mut start = Vec::new();
+        entry.by_ref().take(12).read_to_end(&mut start).map_err(|error| problem(error.to_string()))?;
+        if let Some(length) = header_length(&start).filter(|&length| length > MAX_HEADER) {
+            return Err(problem(format!("its header claims {length} bytes; save the file again")));
+        }
+        let mut whole = start.as_slice().chain(&mut entry);
+        let reader: &mut dyn Read = &mut whole;
         let file = NpyFile::new(reader.take(size)).map_err(|error| problem(error.to_string()))?;
         let shape = file.shape().to_vec();
         if file.order() != Order::C && shape.len() > 1 {
@@ -318,6 +327,13 @@ impl<'a> Archive<'a> {
             found: if found.is_empty() { "no arrays".into() } else { found.join(", ") },
         }
     }
+}
+
+/// What an array of npy version 2 or 3 says about the length of its header, which its reader reserves unseen. Version 1
+/// has two bytes for it.
+fn header_length(start: &[u8]) -> Option<u32> {
+    let &[b'\x93', b'N', b'U', b'M', b'P', b'Y', 2..=255, _, a, b, c, d] = start else { return None };
+    Some(u32::from_le_bytes([a, b, c, d]))
 }
 
 fn array_name(file: &[u8]) -> Option<&str> {

@@ -43,7 +43,7 @@ const AGREE: f32 = 2.0;
 
 /// Per pixel the visible candidate that most others agree with, of those the one with the smallest standard
 /// deviation, of equals the first. Without a majority the doubt is added to its standard deviation: repetitive or
-/// plain texture matches well in wrong places too. Where no candidate is visible, the most certain one.
+/// plain texture matches well in wrong places too. Where no candidate is visible, the same among the hidden ones.
 pub(super) fn choose(candidates: &[Judged]) -> Judged {
     let mut chosen = candidates[0].clone();
     for i in 0..chosen.sigma.len() {
@@ -142,7 +142,10 @@ mod tests {
         let hidden = constant(5.0, 0.0, false, 0.01);
         assert_eq!(pick(&[far.clone(), near.clone(), also_near.clone()]), (1.5, true, 1.0));
         assert_eq!(pick(&[hidden.clone(), near.clone()]), (1.0, true, 2.0));
-        assert_eq!(pick(&[hidden.clone(), hidden]), (5.0, false, 0.01));
+        assert_eq!(pick(&[hidden.clone(), hidden.clone()]), (5.0, false, 0.01));
+        // Agreement comes first among the hidden ones too.
+        let [one, another] = [20.0, 21.0].map(|u| constant(u, 0.0, false, 3.0));
+        assert_eq!(pick(&[hidden, one, another]), (20.0, false, 3.0));
         assert_eq!(pick(&[near, far]), (31.0, true, 0.1f32.hypot(30.0 * DOUBT)));
     }
 

@@ -96,7 +96,7 @@ pub(super) struct Agreement {
 }
 
 /// Compares windows around each pixel of `first` with `second` fetched along `flow`.
-pub(super) fn agreement(first: &Frame, second: &Frame, flow: &Flow) -> Agreement {
+pub(super) fn agreement<P>(first: &Frame<P>, second: &Frame<P>, flow: &Flow) -> Agreement {
     let (width, height) = (flow.width, flow.height);
     let counts = box_counts(width, height, WINDOW);
     let here = first.colours.interiors();
@@ -182,9 +182,9 @@ fn round_trip(flow: &Flow, back: &Flow) -> Vec<f32> {
 }
 
 /// Judges the flow from `first` to `second` by the flow back and by what both frames show.
-pub(super) fn judge(
-    first: &Frame,
-    second: &Frame,
+pub(super) fn judge<P>(
+    first: &Frame<P>,
+    second: &Frame<P>,
     flow: Flow,
     back: &Flow,
     noise: Noise,
@@ -222,7 +222,12 @@ pub(super) fn is_inside(x: f32, y: f32, width: usize, height: usize) -> bool {
 }
 
 /// Withdraws visibility where the frames disagree along the flow: a chain of good steps can still end elsewhere.
-pub(super) fn recheck(first: &Frame, second: &Frame, judged: &mut Judged, settings: &TrackingSettings) {
+pub(super) fn recheck<P>(
+    first: &Frame<P>,
+    second: &Frame<P>,
+    judged: &mut Judged,
+    settings: &TrackingSettings,
+) {
     let agreement = agreement(first, second, &judged.flow);
     for (i, visible) in judged.visible.iter_mut().enumerate() {
         *visible = *visible && agreement.holds(i, settings.correlation);

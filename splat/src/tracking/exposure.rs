@@ -52,8 +52,9 @@ impl Exposure {
     /// `image` times the gain that gives it this exposure; as it is if no gain explains the difference.
     pub(super) fn equalised<'a>(&self, image: &'a Image) -> Cow<'a, Image> {
         let Some(gain) = self.gain_of(&Self::of(image)) else { return Cow::Borrowed(image) };
-        // What a gain makes brighter than white was clipped in the key frame.
-        let pixels = image.pixels.iter().map(|&value| (gain * value).min(value.max(1.0))).collect();
+        // What a gain makes brighter than white was clipped in the key frame. What is not finite is left for its readers.
+        let equal = |&value: &f32| if value.is_finite() { (gain * value).min(value.max(1.0)) } else { value };
+        let pixels = image.pixels.iter().map(equal).collect();
         Cow::Owned(Image { pixels, ..*image })
     }
 
@@ -126,6 +127,16 @@ mod tests {
         for other in [ramp(0.5, 30), ramp(0.5, 60), ramp(0.53, 0), Image::filled(100, 20, [0.3; 3])] {
             assert!(matches!(exposure.equalised(&other), Cow::Borrowed(_)));
         }
+    }
+
+    #[test]
+    fn what_is_not_finite_stays_so() {
+        let exposure = Exposure::of(&ramp(0.5, 0));
+        let mut darker = ramp(0.25, 0);
+        darker.pixels[7] = f32::NAN;
+        darker.pixels[8] = f32::INFINITY;
+        let Cow::Owned(equal) = exposure.equalised(&darker) else { panic!("a gain explains it") };
+        assert!(equal.pixels[7].is_nan() && equal.pixels[8] == f32::INFINITY && equal.pixels[9].is_finite());
     }
 
     #[test]

@@ -6,8 +6,9 @@ use super::{
     TrackingSettings,
     consistency::Judged,
     flow::Flow,
-    pair::{Frame, Guides, match_frames},
+    pair::{Frame, Guides, Pyramid, match_frames},
 };
+use crate::image::Image;
 
 /// The flow from a frame to another, and back, at the finest level of the frames.
 pub(super) struct Ways {
@@ -30,20 +31,32 @@ pub(super) trait PairMatcher: Sync {
     /// Why it may fail.
     type Error;
 
+    /// What it makes of a frame, once.
+    type Prepared;
+
     /// How far its matches err where nothing speaks against them.
     const NOISE: Noise;
+
+    /// A frame for this matcher.
+    fn frame(&self, image: &Image, settings: &TrackingSettings) -> Frame<Self::Prepared>;
 
     /// The flow both ways; `guides` is what is known beforehand.
     fn both_ways(
         &self,
-        first: &Frame,
-        second: &Frame,
+        first: &Frame<Self::Prepared>,
+        second: &Frame<Self::Prepared>,
         guides: Option<Guides<'_>>,
         settings: &TrackingSettings,
     ) -> Result<Ways, Self::Error>;
 
     /// The flow of chosen tracks from the key frame, drawn to where the key frame itself says they are.
-    fn anchored(&self, key: &Frame, frame: &Frame, tracks: &Judged, settings: &TrackingSettings) -> Flow;
+    fn anchored(
+        &self,
+        key: &Frame<Self::Prepared>,
+        frame: &Frame<Self::Prepared>,
+        tracks: &Judged,
+        settings: &TrackingSettings,
+    ) -> Flow;
 }
 
 /// The matcher without weights: patch search and variational refinement.
@@ -51,13 +64,18 @@ pub(super) struct PatchSearch;
 
 impl PairMatcher for PatchSearch {
     type Error = Infallible;
+    type Prepared = Pyramid;
 
     const NOISE: Noise = Noise::SharedAtRest;
 
+    fn frame(&self, image: &Image, settings: &TrackingSettings) -> Frame<Pyramid> {
+        Frame::new(image, settings)
+    }
+
     fn both_ways(
         &self,
-        first: &Frame,
-        second: &Frame,
+        first: &Frame<Pyramid>,
+        second: &Frame<Pyramid>,
         guides: Option<Guides<'_>>,
         settings: &TrackingSettings,
     ) -> Result<Ways, Infallible> {
@@ -65,7 +83,13 @@ impl PairMatcher for PatchSearch {
         Ok(Ways { forward, backward })
     }
 
-    fn anchored(&self, key: &Frame, frame: &Frame, tracks: &Judged, settings: &TrackingSettings) -> Flow {
+    fn anchored(
+        &self,
+        key: &Frame<Pyramid>,
+        frame: &Frame<Pyramid>,
+        tracks: &Judged,
+        settings: &TrackingSettings,
+    ) -> Flow {
         key.refined(frame, tracks.flow.clone(), &tracks.visible, settings)
     }
 }

@@ -28,7 +28,7 @@ mod tracker;
 mod view;
 mod windows;
 
-pub use pair_flow::{DenseFlow, PairFlow, SizesDiffer, pair_flow};
+pub use pair_flow::{DenseFlow, PairFlow, PairFlowError, pair_flow};
 pub use settings::TrackingSettings;
 pub use state::{StateMisfit, TrackState};
 pub use tracker::Tracker;

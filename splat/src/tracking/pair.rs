@@ -114,26 +114,25 @@ fn halvings(image: &Image, settings: &TrackingSettings) -> u32 {
     (at_least..31).find(fits).unwrap_or(31)
 }
 
-/// A frame, prepared for matching and for comparison.
-pub(super) struct Frame {
+/// A frame, prepared for comparison and, by `P`, for its matcher.
+pub(super) struct Frame<P> {
     /// How well a displacement of each pixel of the finest level can be told: the smaller eigenvalue of the structure
     /// tensor.
     pub(super) texture: Vec<f32>,
     /// The finest level, in colour.
     pub(super) colours: Arc<Planes>,
-    pyramid: Pyramid,
+    prepared: P,
 }
 
-impl Frame {
-    pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        let pyramid = Pyramid::new(image, settings);
-        let colours = match &pyramid.levels {
-            Levels::Colour(levels) => Arc::clone(&levels[0].planes),
-            Levels::Luma(_) => Arc::new(Planes::from_image(image, halvings(image, settings))),
-        };
-        Self { texture: texture(&colours), colours, pyramid }
+impl Frame<()> {
+    /// A frame for a matcher that takes its colours.
+    pub(super) fn plain(image: &Image, settings: &TrackingSettings) -> Self {
+        let colours = Arc::new(Planes::from_image(image, halvings(image, settings)));
+        Self { texture: texture(&colours), colours, prepared: () }
     }
+}
 
+impl<P> Frame<P> {
     /// Columns of the finest level.
     pub(super) fn width(&self) -> usize {
         self.colours.width
@@ -142,6 +141,17 @@ impl Frame {
     /// Rows of the finest level.
     pub(super) fn height(&self) -> usize {
         self.colours.height
+    }
+}
+
+impl Frame<Pyramid> {
+    pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
+        let pyramid = Pyramid::new(image, settings);
+        let colours = match &pyramid.levels {
+            Levels::Colour(levels) => Arc::clone(&levels[0].planes),
+            Levels::Luma(_) => Arc::new(Planes::from_image(image, halvings(image, settings))),
+        };
+        Self { texture: texture(&colours), colours, prepared: pyramid }
     }
 
     /// `flow` to another frame, refined at the finest level where `trust` says that colour counts.
@@ -153,7 +163,7 @@ impl Frame {
         settings: &TrackingSettings,
     ) -> Flow {
         let (instructions, trust, smoothing) = (Instructions::detect(), Some(trust), Smoothing::of(settings));
-        match (&self.pyramid.levels, &other.pyramid.levels) {
+        match (&self.prepared.levels, &other.prepared.levels) {
             (Levels::Luma(a), Levels::Luma(b)) => refine(instructions, &a[0], &b[0], flow, trust, smoothing),
             (Levels::Colour(a), Levels::Colour(b)) => {
                 refine(instructions, &a[0], &b[0], flow, trust, smoothing)
@@ -185,12 +195,12 @@ impl<'a> Guides<'a> {
 
 /// The flow from `first` to `second` and the flow back, at the finest level. Frames must have the same size.
 pub(super) fn match_frames(
-    first: &Frame,
-    second: &Frame,
+    first: &Frame<Pyramid>,
+    second: &Frame<Pyramid>,
     guides: Option<Guides<'_>>,
     settings: &TrackingSettings,
 ) -> (Flow, Flow) {
-    match_pyramids(Instructions::detect(), &first.pyramid, &second.pyramid, guides, settings)
+    match_pyramids(Instructions::detect(), &first.prepared, &second.prepared, guides, settings)
 }
 
 /// [`match_frames`] of frames that are only matched, with certain instructions.

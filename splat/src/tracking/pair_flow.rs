@@ -20,6 +20,17 @@ pub struct DenseFlow {
 }
 
 impl DenseFlow {
+    /// Refuses another size than `first`, and what is not one displacement per pixel.
+    fn check(&self, first: (u32, u32)) -> Result<(), PairFlowError> {
+        let (width, height) = (self.width, self.height);
+        same_size(first, (width, height))?;
+        let displacements = self.displacement.len();
+        if displacements != width as usize * height as usize {
+            return Err(PairFlowError::Displacements { width, height, displacements });
+        }
+        Ok(())
+    }
+
     fn planar(&self) -> Flow {
         let axis = |axis: usize| self.displacement.iter().map(|displacement| displacement[axis]).collect();
         Flow { width: self.width as usize, height: self.height as usize, u: axis(0), v: axis(1) }
@@ -35,17 +46,36 @@ pub struct PairFlow {
     pub backward: DenseFlow,
 }
 
-/// The images, or the initial flow, have different sizes.
+/// Why two images cannot be matched.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "a flow between {} x {} and {} x {} pixels; give images and initial flows of one size",
-    first.0, first.1, second.0, second.1
-)]
-pub struct SizesDiffer {
-    /// Columns and rows of the first image.
-    pub first: (u32, u32),
-    /// Columns and rows of what differs from it.
-    pub second: (u32, u32),
+pub enum PairFlowError {
+    /// The images, or the initial flow, have different sizes.
+    #[error(
+        "a flow between {} x {} and {} x {} pixels; give images and initial flows of one size",
+        first.0, first.1, second.0, second.1
+    )]
+    SizesDiffer {
+        /// Columns and rows of the first image.
+        first: (u32, u32),
+        /// Columns and rows of what differs from it.
+        second: (u32, u32),
+    },
+    /// The initial flow is not one displacement per pixel.
+    #[error(
+        "an initial flow of {width} x {height} pixels has {displacements} displacements; give one per pixel"
+    )]
+    Displacements {
+        /// Columns that it states.
+        width: u32,
+        /// Rows that it states.
+        height: u32,
+        /// Displacements that it has.
+        displacements: usize,
+    },
+}
+
+fn same_size(first: (u32, u32), second: (u32, u32)) -> Result<(), PairFlowError> {
+    if first == second { Ok(()) } else { Err(PairFlowError::SizesDiffer { first, second }) }
 }
 
 /// Matches two images both ways.
@@ -57,15 +87,12 @@ pub fn pair_flow(
     second: &Image,
     initial: Option<&PairFlow>,
     settings: &TrackingSettings,
-) -> Result<PairFlow, SizesDiffer> {
+) -> Result<PairFlow, PairFlowError> {
     let size = (first.width, first.height);
-    let flows = initial.iter().flat_map(|initial| [&initial.forward, &initial.backward]);
-    let sizes =
-        std::iter::once((second.width, second.height)).chain(flows.map(|flow| (flow.width, flow.height)));
-    for second in sizes {
-        if second != size {
-            return Err(SizesDiffer { first: size, second });
-        }
+    same_size(size, (second.width, second.height))?;
+    if let Some(PairFlow { forward, backward }) = initial {
+        forward.check(size)?;
+        backward.check(size)?;
     }
     if first.pixel_count() == 0 {
         let nothing = DenseFlow { width: size.0, height: size.1, displacement: Vec::new() };

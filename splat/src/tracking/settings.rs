@@ -30,7 +30,7 @@ pub struct TrackingSettings {
     /// always sees colour.
     pub colour: bool,
     /// Distances in frames over which tracks are chained besides the direct match with the key frame; up to 16 of 1 to
-    /// 1000, default 1 and 2, with `draft` 1, with `best` 1, 2, 4 and 8.
+    /// 1000, none twice, default 1 and 2, with `draft` 1, with `best` 1, 2, 4 and 8.
     #[serde(deserialize_with = "range::gaps")]
     pub gaps: Vec<u32>,
     /// Frames of a view that a worker tracks before the next view has its turn; 1 to 100 000, default 16. The tracks are
@@ -61,7 +61,8 @@ pub struct TrackingSettings {
     /// Sweeps of the variational refinement per linearisation; 0 (off) to 1000, default 10.
     #[serde(deserialize_with = "range::whole::<0, 1000, _>")]
     pub smoothing_iterations: u32,
-    /// Forward-backward error above which a pixel is called hidden, pixels; above 0, default 1.5.
+    /// Forward-backward error above which a pixel is called hidden, in pixels of the resolution that is matched (see
+    /// `full_side`); above 0, default 1.5.
     #[serde(deserialize_with = "range::distance")]
     pub consistency: f32,
     /// Correlation of the surroundings below which a textured pixel is called hidden; -1 to 1, default 0.5.
@@ -73,7 +74,8 @@ pub struct TrackingSettings {
     /// Standard deviation added to the guesses of hidden pixels, pixels; above 0, default 16.
     #[serde(deserialize_with = "range::distance")]
     pub hidden_sigma: f32,
-    /// How images reach a learned tracker; without effect on the built-in one.
+    /// How images reach a learned tracker; without effect on the built-in one. docs/trackers.md says which of the other
+    /// settings a learned tracker knows.
     pub onnx: OnnxSettings,
 }
 

@@ -420,6 +420,7 @@ fn settings_survive_a_round_trip_and_refuse_unknown_keys() {
         (r#"{"consistency": 0}"#, "above 0"),
         (r#"{"sigma_floor": 0}"#, "above 0"),
         (r#"{"gaps": [1, 0]}"#, "between 1 and 1000"),
+        (r#"{"gaps": [2, 1, 2]}"#, "different distances"),
         (r#"{"window": 0}"#, "between 1 and 100000"),
     ] {
         let error = serde_json::from_str::<TrackingSettings>(wrong).unwrap_err().to_string();

@@ -15,9 +15,9 @@ use super::{
 use crate::image::Image;
 
 /// A frame that later frames may be chained to.
-struct Past {
+struct Past<P> {
     index: usize,
-    frame: Frame,
+    frame: Frame<P>,
     tracks: Judged,
 }
 
@@ -110,7 +110,7 @@ where
 }
 
 /// A view that is tracked.
-struct View<'a, M> {
+struct View<'a, M: PairMatcher> {
     size: (u32, u32),
     /// None where the key frame has no pixels.
     tracker: Option<Tracker<'a, M>>,
@@ -189,14 +189,14 @@ fn unknown_sigma(width: u32, height: u32) -> f32 {
     width.max(height).max(1) as f32
 }
 
-pub(super) struct Tracker<'a, M> {
+pub(super) struct Tracker<'a, M: PairMatcher> {
     settings: &'a TrackingSettings,
     matcher: &'a M,
     width: u32,
     height: u32,
-    key: Frame,
+    key: Frame<M::Prepared>,
     exposure: Exposure,
-    past: VecDeque<Past>,
+    past: VecDeque<Past<M::Prepared>>,
 }
 
 impl<'a, M: PairMatcher> Tracker<'a, M> {
@@ -206,14 +206,14 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
             matcher,
             width: key.width,
             height: key.height,
-            key: Frame::new(key, settings),
+            key: matcher.frame(key, settings),
             exposure: Exposure::of(key),
             past: VecDeque::new(),
         }
     }
 
     pub(super) fn track(&mut self, index: usize, image: &Image) -> Result<TrackField, M::Error> {
-        let frame = Frame::new(&self.exposure.equalised(image), self.settings);
+        let frame = self.matcher.frame(&self.exposure.equalised(image), self.settings);
         let chains = self.chains(index, &frame)?;
         let guess = (!chains.is_empty()).then(|| chain::choose(&chains));
         let direct = self.direct(&frame, guess.as_ref())?;
@@ -265,7 +265,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
                 size[0], size[1]
             ));
         }
-        let frame = Frame::new(&self.exposure.equalised(image), self.settings);
+        let frame = self.matcher.frame(&self.exposure.equalised(image), self.settings);
         let index = remembered.index as usize;
         self.past.push_back(Past { index, frame, tracks: remembered.into_judged(size) });
         Ok(())
@@ -278,12 +278,12 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
     }
 
     /// The tracks of earlier frames, continued to this one.
-    fn chains(&self, index: usize, frame: &Frame) -> Result<Vec<Judged>, M::Error> {
+    fn chains(&self, index: usize, frame: &Frame<M::Prepared>) -> Result<Vec<Judged>, M::Error> {
         let earlier =
             self.settings.gaps.iter().filter_map(|&gap| {
                 self.past.iter().find(|past| gap > 0 && past.index + gap as usize == index)
             });
-        let continue_from = |past: &Past| {
+        let continue_from = |past: &Past<M::Prepared>| {
             let Ways { forward, backward } =
                 self.matcher.both_ways(&past.frame, frame, None, self.settings)?;
             let onward = consistency::judge(&past.frame, frame, forward, &backward, M::NOISE, self.settings);
@@ -295,7 +295,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
     }
 
     /// The match of the key frame with this one, helped by the chained tracks.
-    fn direct(&self, frame: &Frame, guess: Option<&Judged>) -> Result<Judged, M::Error> {
+    fn direct(&self, frame: &Frame<M::Prepared>, guess: Option<&Judged>) -> Result<Judged, M::Error> {
         let back: Option<Flow> = guess.map(chain::inverted);
         let guides = match (guess, &back) {
             (Some(guess), Some(backward)) => Some(Guides { forward: &guess.flow, backward, scale: 1.0 }),
@@ -306,7 +306,7 @@ impl<'a, M: PairMatcher> Tracker<'a, M> {
     }
 
     /// The tracks, refined once more against the key frame itself.
-    fn anchored(&self, frame: &Frame, tracks: Judged) -> Judged {
+    fn anchored(&self, frame: &Frame<M::Prepared>, tracks: Judged) -> Judged {
         let flow = self.matcher.anchored(&self.key, frame, &tracks, self.settings);
         let before = tracks.flow;
         let mut anchored = Judged { flow, ..tracks };

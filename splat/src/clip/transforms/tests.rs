@@ -236,6 +236,26 @@ fn duplicates_are_refused() {
 }
 
 #[test]
+fn names_that_lead_elsewhere_are_refused() {
+    let named = |name: &str| {
+        let name = name.to_owned();
+        single(move |index, entry| {
+            let camera = if index == 1 { name.clone() } else { format!("rig/{index}") };
+            entry["camera"] = camera.into();
+        })
+    };
+    for name in ["../x", "/x", "a/../b", "a//b", ".", "", "a\\b", "a\nb", "a\0"] {
+        let error = named(name).error(&["transforms.json", "no file can be given"]);
+        assert!(matches!(error, ClipError::ViewName { .. }));
+    }
+    let clip = named("rig/a.b").open().unwrap();
+    let files: Vec<String> = clip.views().iter().map(|view| crate::clip::file_stem(&view.name)).collect();
+    assert_eq!(files, ["rig_0", "rig_2", "rig_3", "rig_a.b"]);
+    let error = named("rig_2").error(&["rig/2", "rig_2", "rename"]);
+    assert!(matches!(error, ClipError::SameFiles { .. }));
+}
+
+#[test]
 fn missing_frames_are_named() {
     let clip = per_frame();
     edit(&clip, "transforms/frame_0002.json", |file| drop(file["frames"].as_array_mut().unwrap().remove(1)));

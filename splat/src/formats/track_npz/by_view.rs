@@ -1,8 +1,10 @@
 //! Which of several track files holds the tracks of which view.
 
-use std::{fmt, path::Path};
+use std::{collections::BTreeSet, fmt, path::Path};
 
 use thiserror::Error;
+
+use crate::clip::file_stem;
 
 /// Why files cannot be given to views without guessing.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
@@ -69,7 +71,7 @@ impl fmt::Display for Names {
 
 /// The track file of each of `views`, in their order; `clip_views` are the names of all views of the clip.
 ///
-/// If every one of `views` is the name of a file without its ending, names decide, and further files are ignored.
+/// If every one of `views` is the name of a file without its ending ([`file_stem`]), names decide, and further files are ignored.
 /// Otherwise order decides, if there are as many files as views and none is named after another view of the clip than
 /// the one that it would be given to. Whatever else is refused: tracks of the wrong view look like any others.
 pub fn files_by_view<'a, P: AsRef<Path>>(
@@ -86,7 +88,8 @@ pub fn files_by_view<'a, P: AsRef<Path>>(
 
 /// The file that is named after `view`, if there is one.
 fn file_named<'a, P: AsRef<Path>>(files: &'a [P], view: &str) -> Result<Option<&'a P>, TrackFilesError> {
-    let mut named = files.iter().filter(|file| stem(file) == Some(view));
+    let name = file_stem(view);
+    let mut named = files.iter().filter(|file| stem(file) == Some(&name));
     let found = named.next();
     if let (Some(first), Some(second)) = (found, named.next()) {
         let [first, second] = [first, second].map(|file| file.as_ref().display().to_string());
@@ -108,8 +111,10 @@ fn by_order<'a, P: AsRef<Path>>(
         let (files, views) = names();
         return Err(TrackFilesError::Count { missing, files, views });
     }
-    let is_of_another =
-        |file: &P, view: &str| stem(file).is_some_and(|name| name != view && clip_views.contains(&name));
+    let names_in_clip: BTreeSet<String> = clip_views.iter().map(|view| file_stem(view)).collect();
+    let is_of_another = |file: &P, view: &str| {
+        stem(file).is_some_and(|name| name != file_stem(view) && names_in_clip.contains(name))
+    };
     if let Some((file, view)) = files.iter().zip(views).find(|(file, view)| is_of_another(file, view)) {
         let (file, view) = (file_name(file), (*view).to_owned());
         let (files, views) = names();
@@ -177,6 +182,15 @@ mod tests {
         }
         assert!(refusal(&["any.npz"]).contains("1 files (any.npz)"));
         assert!(refusal(&[]).contains("0 files"));
+    }
+
+    #[test]
+    fn nested_folders_of_a_view_are_one_name() {
+        let views = ["left/cam0", "right/cam0"];
+        let files = ["right_cam0.npz", "left_cam0.npz"];
+        assert_eq!(files_by_view(&files, &views, &views), Ok(vec![&files[1], &files[0]]));
+        let message = files_by_view(&["right_cam0.npz", "any.npz"], &views, &views).unwrap_err().to_string();
+        assert!(message.contains("right_cam0.npz would be given to view 'left/cam0'"), "{message}");
     }
 
     #[test]

@@ -309,6 +309,18 @@ fn points_of_another_shape_are_refused() {
 }
 
 #[test]
+fn a_header_that_claims_gigabytes_is_refused_before_it_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tracks.npz");
+    let mut zip = ZipWriter::new(File::create(&path).unwrap());
+    zip.start_file("tracks.npy", SimpleFileOptions::default()).unwrap();
+    zip.write_all(b"\x93NUMPY\x02\x00\xff\xff\xff\xff").unwrap();
+    zip.finish().unwrap();
+    let message = read_track_npz(&path).unwrap_err().to_string();
+    assert!(message.contains("header claims 4294967295 bytes"), "{message}");
+}
+
+#[test]
 fn what_an_entry_says_about_its_size_reserves_nothing() {
     // Both the directory and the array claim 4 GB; the file has not 200 bytes.
     let mut bytes = Vec::new();

@@ -4,12 +4,15 @@ use super::{
     LearnedError, LearnedTracker,
     network::{Input, Maps},
 };
-use crate::tracking::{
-    TrackingSettings,
-    consistency::Judged,
-    flow::Flow,
-    matcher::{Noise, PairMatcher, Ways},
-    pair::{Frame, Guides},
+use crate::{
+    image::Image,
+    tracking::{
+        TrackingSettings,
+        consistency::Judged,
+        flow::Flow,
+        matcher::{Noise, PairMatcher, Ways},
+        pair::{Frame, Guides},
+    },
 };
 
 /// Displacement that leads out of any image, in its longer sides: what stands where the network says nothing.
@@ -20,13 +23,18 @@ const LEAST_SIGMA: f32 = 0.03;
 
 impl PairMatcher for LearnedTracker {
     type Error = LearnedError;
+    type Prepared = ();
 
     const NOISE: Noise = Noise::Unknown(LEAST_SIGMA);
 
+    fn frame(&self, image: &Image, settings: &TrackingSettings) -> Frame<()> {
+        Frame::plain(image, settings)
+    }
+
     fn both_ways(
         &self,
-        first: &Frame,
-        second: &Frame,
+        first: &Frame<()>,
+        second: &Frame<()>,
         _guides: Option<Guides<'_>>,
         _settings: &TrackingSettings,
     ) -> Result<Ways, LearnedError> {
@@ -38,7 +46,13 @@ impl PairMatcher for LearnedTracker {
     }
 
     /// The network has seen more than the refinement could add.
-    fn anchored(&self, _key: &Frame, _frame: &Frame, tracks: &Judged, _settings: &TrackingSettings) -> Flow {
+    fn anchored(
+        &self,
+        _key: &Frame<()>,
+        _frame: &Frame<()>,
+        tracks: &Judged,
+        _settings: &TrackingSettings,
+    ) -> Flow {
         tracks.flow.clone()
     }
 }

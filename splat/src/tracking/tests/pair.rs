@@ -231,10 +231,14 @@ fn an_initial_flow_leads_where_no_search_goes() {
 fn images_of_different_sizes_are_refused_by_name() {
     let (first, second) = (Image::filled(8, 6, [0.5; 3]), Image::filled(8, 7, [0.5; 3]));
     let error = pair_flow(&first, &second, None, &balanced()).unwrap_err();
-    assert_eq!(error, SizesDiffer { first: (8, 6), second: (8, 7) });
+    assert_eq!(error, PairFlowError::SizesDiffer { first: (8, 6), second: (8, 7) });
     assert!(error.to_string().contains("8 x 7"));
     let initial = flow_between(&second, &second, Quality::Draft);
     assert!(pair_flow(&first, &first, Some(&initial), &balanced()).is_err());
+    let mut short = flow_between(&first, &first, Quality::Draft);
+    short.backward.displacement.pop();
+    let error = pair_flow(&first, &first, Some(&short), &balanced()).unwrap_err();
+    assert_eq!(error, PairFlowError::Displacements { width: 8, height: 6, displacements: 47 });
 }
 
 #[test]
