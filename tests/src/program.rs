@@ -12,13 +12,16 @@ use std::{
 /// Longer than anything a healthy run does; a hung run fails with its log instead of hanging the gate.
 const PATIENCE: Duration = Duration::from_secs(180);
 
-/// Path of the program, built once with the profile of the tests.
+/// Path of the program: what `TRACKERSPLAT_PROGRAM` names, else built once with the profile of the tests.
 ///
 /// # Panics
 /// If the program cannot be built.
 pub fn path() -> &'static Path {
     static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
     PROGRAM.get_or_init(|| {
+        if let Some(built) = std::env::var_os("TRACKERSPLAT_PROGRAM") {
+            return built.into();
+        }
         let test = std::env::current_exe().expect("a test knows its own file");
         let folder = test.ancestors().nth(2).expect("tests lie in <profile>/deps");
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());

@@ -19,11 +19,16 @@ pub(crate) fn run(arguments: &[&str]) -> Result<()> {
 
 /// Runs every test of the workspace and closes with the sums.
 pub(crate) fn test() -> Result<()> {
-    // The end-to-end tests run the program itself.
-    run(&["build", "--package", "trackersplat"])?;
+    // The end-to-end tests run the program itself. Built alone its dependencies would have other features than those of
+    // the tests, and nearly everything would be compiled twice.
+    run(&["build", "--workspace", "--tests", "--bin", "trackersplat"])?;
+    let program = std::env::current_exe().context("the folder of this program")?;
+    let program = program.with_file_name(format!("trackersplat{}", std::env::consts::EXE_SUFFIX));
     let arguments = ["test", "--workspace", "--no-fail-fast"];
     announce(&arguments);
-    let mut child = cargo().args(arguments).stdout(Stdio::piped()).spawn().context("cannot start cargo")?;
+    let mut tests = cargo();
+    tests.args(arguments).env("TRACKERSPLAT_PROGRAM", program).stdout(Stdio::piped());
+    let mut child = tests.spawn().context("cannot start cargo")?;
     let output = child.stdout.take().context("the output of cargo test")?;
     let mut sums = Sums::default();
     for line in BufReader::new(output).lines() {
