@@ -14,7 +14,7 @@ use trackersplat_tests::{clips, program};
 const QUICK: [&str; 2] = ["--quality", "draft"];
 
 /// The images as they are: standard deviations are smallest where nothing is scaled.
-const WHOLE: [&str; 4] = ["--quality", "draft", "--set", "tracking.max_side=800"];
+const WHOLE: [&str; 4] = ["--quality", "draft", "--set", "tracking.full_side=800"];
 
 fn text(path: &Path) -> &str {
     path.to_str().unwrap()

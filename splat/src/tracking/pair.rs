@@ -109,7 +109,7 @@ impl Pyramid {
 /// How often an image is halved before it is matched.
 fn halvings(image: &Image, settings: &TrackingSettings) -> u32 {
     let longer = image.width.max(image.height);
-    let at_least = u32::from(longer > settings.full_side);
+    let at_least = if longer > settings.quarter_side { 2 } else { u32::from(longer > settings.full_side) };
     let fits = |&halvings: &u32| longer.div_ceil(1 << halvings) <= settings.max_side.max(2);
     (at_least..31).find(fits).unwrap_or(31)
 }

@@ -10,11 +10,15 @@ use crate::settings::{Quality, range};
 #[serde(default, deny_unknown_fields)]
 pub struct TrackingSettings {
     /// Images whose longer side has more pixels than this are matched at half their resolution or less; 16 to 65 536,
-    /// default 400, with `best` 1600. What moves by a pixel is found to a tenth of one, so little is lost.
+    /// default 400, with `draft` 160, with `best` 1600. What moves by a pixel is found to a tenth of one, so little is lost.
     #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
     pub full_side: u32,
-    /// Images are halved until their longer side is at most this many pixels; 16 to 65 536, default 800, with `draft`
-    /// 160, with `best` 1600.
+    /// Images whose longer side has more pixels than this are matched at a quarter of their resolution or less; 16 to
+    /// 65 536, default 65 536, with `draft` 320.
+    #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
+    pub quarter_side: u32,
+    /// Images are halved until their longer side is at most this many pixels; 16 to 65 536, default 800, with `best`
+    /// 1600.
     #[serde(deserialize_with = "range::whole::<16, 65_536, _>")]
     pub max_side: u32,
     /// Images of the exhaustive search are halved until their longer side is at most this many pixels; 16 to 256,
@@ -90,6 +94,7 @@ impl TrackingSettings {
     pub fn preset(quality: Quality) -> Self {
         let balanced = Self {
             full_side: 400,
+            quarter_side: 65_536,
             max_side: 800,
             search_side: 100,
             search_radius: 0.4,
@@ -111,7 +116,8 @@ impl TrackingSettings {
         };
         match quality {
             Quality::Draft => Self {
-                max_side: 160,
+                full_side: 160,
+                quarter_side: 320,
                 search_side: 80,
                 gaps: vec![1],
                 patch_stride: 5,

@@ -64,7 +64,8 @@ impl LearnedTracker {
         // Halving an image of twice the side or more leaves the side; `seen` is the largest that is not halved.
         let seen = 2 * self.network.longest_side() as u32 - 1;
         let [max_side, full_side] = [settings.max_side, settings.full_side].map(|side| side.max(seen));
-        TrackingSettings { max_side, full_side, ..settings.clone() }
+        let quarter_side = settings.quarter_side.max(2 * seen);
+        TrackingSettings { max_side, full_side, quarter_side, ..settings.clone() }
     }
 
     fn flow(&self, first: &Input, second: &Input) -> Result<Flow, LearnedError> {

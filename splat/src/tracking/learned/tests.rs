@@ -125,7 +125,8 @@ fn pair_flow_is_chained_and_judged() {
 fn a_pair_network_sees_what_its_own_settings_say() {
     // Frames of 200 pixels; the built-in tracker would see 25. A network that sees fewer pixels than the slope is for
     // measures a motion that is wrong by their ratio.
-    let chains = TrackingSettings { max_side: 32, ..TrackingSettings::default() };
+    let [full_side, quarter_side, max_side] = [32; 3];
+    let chains = TrackingSettings { full_side, quarter_side, max_side, ..TrackingSettings::default() };
     let motion = [3.0, -1.0];
     let seen_whole = (pair_net(255.0 * SLOPE), OnnxSettings::default());
     let seen_halved =

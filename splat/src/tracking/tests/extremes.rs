@@ -56,6 +56,7 @@ fn extreme_settings_give_finite_tracks() {
     // No file may say these, but a caller may.
     let all_zero = TrackingSettings {
         full_side: 0,
+        quarter_side: 0,
         max_side: 0,
         search_side: 0,
         search_radius: 0.0,

@@ -300,6 +300,7 @@ fn settings_at_the_ends_of_their_ranges_do_no_harm() {
         ("search_radius", [0.0, 1.0]),
         ("max_side", [16.0, 65_536.0]),
         ("full_side", [16.0, 65_536.0]),
+        ("quarter_side", [16.0, 65_536.0]),
     ] {
         for value in values {
             let mut settings = serde_json::to_value(balanced()).unwrap();
