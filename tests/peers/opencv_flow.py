@@ -4,6 +4,7 @@
     pip install opencv-python-headless numpy
     tests/peers/opencv_flow.py CLIP... --program target/release/trackersplat [--quality balanced] > table.md
     tests/peers/opencv_flow.py --speed CLIP
+    tests/peers/opencv_flow.py --enlarge 4 --views cam00,cam03,cam06 CLIP...
 
 Not part of CI. Everything runs on one thread. Ours comes from `trackersplat eval-tracks CLIP --json`, on the same
 views and frames and by the same definitions:
@@ -248,6 +249,28 @@ def accuracy(folder, arguments):
     print_table(clip.folder.name, rows)
 
 
+def enlarged(folder, views, factor):
+    """Errors of DIS, direct, on frames enlarged by a factor (bicubic), in pixels of the clip: the flow is averaged over what
+    each pixel became. Ours is `cargo bench -p splat --bench pair_flow -- --enlarge FACTOR`."""
+    clip = Clip(folder, views)
+    for name, preset in {"fast": 1, "medium": 2}.items():
+        method, errors, moving = dis(preset), [], []
+        for view in clip.views:
+            images = clip.images(view)
+            height, width = images[0].shape
+            size = (factor * width, factor * height)
+            images = [cv2.resize(image, size, interpolation=cv2.INTER_CUBIC) for image in images]
+            flow, visible, mask = clip.truth(view)
+            for image, exact, seen in zip(images[1:], flow, visible):
+                found = method(images[0], image).reshape(height, factor, width, factor, 2).mean((1, 3)) / factor
+                error = np.linalg.norm(found - exact, axis=-1)
+                errors.append(error[seen])
+                moving.append(error[seen & mask])
+        groups = [np.concatenate(group) for group in (errors, moving)]
+        cells = [f"{group.mean():.3f} / {np.median(group):.3f}" if len(group) else "–" for group in groups]
+        print(f"| DIS {name}, {factor} times | {clip.folder.name} | " + " | ".join(cells) + " |")
+
+
 def speed(folder, repeats=15):
     """Milliseconds of processor time per pair of frames, the least of several; ours is `cargo bench -p splat --bench pair_flow`."""
     view = sorted((pathlib.Path(folder) / "images").iterdir())[0]
@@ -274,10 +297,16 @@ def main():
     parser.add_argument("--quality", default="balanced", help="presets of ours, separated by commas")
     parser.add_argument("--views", help="names, separated by commas; all training views if left out")
     parser.add_argument("--speed", action="store_true", help="the time of DIS per pair instead")
+    parser.add_argument("--enlarge", type=int, help="DIS on frames enlarged by this factor instead: mean / median, all and moving")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     for folder in arguments.clips:
-        speed(folder) if arguments.speed else accuracy(folder, arguments)
+        if arguments.speed:
+            speed(folder)
+        elif arguments.enlarge:
+            enlarged(folder, arguments.views.split(",") if arguments.views else [], arguments.enlarge)
+        else:
+            accuracy(folder, arguments)
 
 
 if __name__ == "__main__":
