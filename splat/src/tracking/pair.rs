@@ -84,7 +84,7 @@ pub(super) enum Levels {
 impl Pyramid {
     /// The pyramid of an image that has pixels.
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        let halvings = halvings(image, settings);
+        let halvings = halvings(image.width.max(image.height), settings);
         let levels = if settings.colour {
             Levels::Colour(Level::pyramid(Planes::from_image(image, halvings), settings))
         } else {
@@ -106,9 +106,16 @@ impl Pyramid {
     }
 }
 
-/// How often an image is halved before it is matched.
-fn halvings(image: &Image, settings: &TrackingSettings) -> u32 {
-    let longer = image.width.max(image.height);
+impl TrackingSettings {
+    /// Columns and rows at which the built-in tracker matches images of this size: the size of its states.
+    pub fn matched_size(&self, width: u32, height: u32) -> (u32, u32) {
+        let side = 1 << halvings(width.max(height), self);
+        (width.div_ceil(side), height.div_ceil(side))
+    }
+}
+
+/// How often an image of this longer side is halved before it is matched.
+fn halvings(longer: u32, settings: &TrackingSettings) -> u32 {
     let at_least = u32::from(longer > settings.full_side);
     let fits = |&halvings: &u32| longer.div_ceil(1 << halvings) <= settings.max_side.max(2);
     (at_least..31).find(fits).unwrap_or(31)
@@ -129,7 +136,10 @@ impl Frame {
         let pyramid = Pyramid::new(image, settings);
         let colours = match &pyramid.levels {
             Levels::Colour(levels) => Arc::clone(&levels[0].planes),
-            Levels::Luma(_) => Arc::new(Planes::from_image(image, halvings(image, settings))),
+            Levels::Luma(_) => {
+                let halvings = halvings(image.width.max(image.height), settings);
+                Arc::new(Planes::from_image(image, halvings))
+            }
         };
         Self { texture: texture(&colours), colours, pyramid }
     }
