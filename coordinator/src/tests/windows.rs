@@ -1,7 +1,7 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 //! Views that are tracked window by window, by workers and by the coordinator.
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use splat::{
     formats::{track_blob, track_state},
@@ -30,22 +30,28 @@ fn request(bench: &Bench, window: u32) -> SubmitRequest {
     SubmitRequest { settings_json: format!(r#"{{"tracking": {{"window": {window}}}}}"#), ..bench.request() }
 }
 
-/// A state that remembers one frame, another one for every view.
-fn state_of(view: &str, place: usize) -> Vec<u8> {
-    let motion = view.bytes().map(f32::from).sum::<f32>() * 0.01;
+/// The state of an honest tracker after the frame at a place, another one for every view.
+pub(super) fn state_of(view: &str, place: usize) -> Vec<u8> {
+    state_of_size((8, 6), view, 1..place + 1)
+}
+
+/// The state after tracking frames from the key frame on.
+pub(super) fn state_of_size((width, height): (u32, u32), view: &str, frames: Range<usize>) -> Vec<u8> {
+    let motion = 0.2 * (view.bytes().map(u32::from).sum::<u32>() % 7) as f32;
     let image = |place: usize| {
-        let mut image = Image::filled(24, 16, [0.0; 3]);
+        let mut image = Image::filled(width, height, [0.0; 3]);
         for (index, pixel) in image.pixels.chunks_exact_mut(3).enumerate() {
-            let (x, y) = ((index % 24) as f32 - motion * place as f32, (index / 24) as f32);
-            pixel.fill(0.5 + 0.25 * (x * 0.9).sin() + 0.25 * (y * 0.7).cos());
+            let (x, y) = (index % width as usize, index / width as usize);
+            let x = x as f32 - motion * place as f32;
+            pixel.fill(0.5 + 0.25 * (x * 0.9).sin() + 0.25 * (y as f32 * 0.7).cos());
         }
         Arc::new(image)
     };
     let mut load = |place| Ok::<_, StageError>(image(place));
     let settings = TrackingSettings::default();
-    let (nothing, window) = (TrackState::default(), place..place + 1);
+    let nothing = TrackState::default();
     let tracked =
-        Tracker::BuiltIn.track_window(nothing, window, &|_| true, &mut load, &settings, &mut |_, _| Ok(()));
+        Tracker::BuiltIn.track_window(nothing, frames, &|_| true, &mut load, &settings, &mut |_, _| Ok(()));
     track_state::encode(&tracked.ok().unwrap())
 }
 

@@ -52,7 +52,8 @@ fn end_point_errors(flow: &DenseFlow, truth: impl Fn([f32; 2]) -> [f32; 2]) -> V
 fn frames_are_matched_at_the_size_that_the_settings_say() {
     for quality in QUALITIES {
         let settings = TrackingSettings::preset(quality);
-        for (width, height) in [(1, 1), (8, 6), (400, 3), (401, 3), (5, 799), (801, 2), (3, 1601), (3203, 1)] {
+        for (width, height) in [(1, 1), (8, 6), (400, 3), (401, 3), (5, 799), (801, 2), (3, 1601), (3203, 1)]
+        {
             let frame = Frame::new(&Image::filled(width, height, [0.5; 3]), &settings);
             let found = (frame.width() as u32, frame.height() as u32);
             assert_eq!(settings.matched_size(width, height), found, "{quality:?} {width}x{height}");
