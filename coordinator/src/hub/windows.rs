@@ -193,7 +193,7 @@ impl Hub {
 
     /// Forgets states that nobody goes on from any more, with the desk held: who keeps the same one meanwhile finds it gone.
     /// Files go before rows, so that a coordinator that is killed in between leaves no file that nothing names.
-    pub(super) async fn forget_states(&self, states: &[State]) -> Result<(), StoreError> {
+    pub(crate) async fn forget_states(&self, states: &[State]) -> Result<(), StoreError> {
         if states.is_empty() {
             return Ok(());
         }
