@@ -342,8 +342,8 @@ async fn of_two_jobs_of_one_clip_one_tracks_and_the_other_takes_over() {
     let second = bench.submit(again).await.unwrap().job_id;
     let ready = |event: &Event| matches!(event, Event::TracksState(t) if t.view == "cam02");
     bench.watch(&second, 0).await.until(ready).await;
-    let mut windows = worker.finish_job(&bench, &first).await;
-    windows.extend(worker.finish_job(&bench, &second).await);
+    let windows = worker.finish_job(&bench, &second).await;
+    assert_eq!(bench.ended(&first).await.0, JobState::Done);
     let (empty, tracked): (Vec<_>, Vec<_>) = windows.into_iter().partition(|window| window.1.is_empty());
     let views: Vec<&str> = empty.iter().map(|window| window.0.as_str()).collect();
     assert_eq!(views, ["cam00", "cam01", "cam02"], "of the second job only the reports are left");
