@@ -103,6 +103,15 @@ impl BlobStore {
         self.store.head(&path).await.is_ok_and(|found| found.size == blob.size)
     }
 
+    /// Whether a blob is known to be gone, or of another size. A store that cannot be asked now lacks nothing.
+    pub async fn lacks(&self, blob: &Blob) -> bool {
+        let Ok(path) = path_of(&blob.digest) else { return true };
+        match self.store.head(&path).await {
+            Ok(found) => found.size != blob.size,
+            Err(error) => matches!(error, object_store::Error::NotFound { .. }),
+        }
+    }
+
     /// The bytes of a blob, verified.
     pub async fn get(&self, blob: &Blob) -> Result<Bytes, BlobError> {
         let bytes = self.open_blob(&blob.digest).await?.bytes().await?;
@@ -309,6 +318,25 @@ mod tests {
         assert!(matches!(store.read("../../etc/passwd", 10).await, Err(BlobError::Name(_))));
         let hostile = Blob { digest: "../up".into(), size: 1 };
         assert!(matches!(store.upload(hostile).await, Err(BlobError::Name(_))));
+    }
+
+    #[tokio::test]
+    async fn a_store_that_cannot_be_asked_lacks_nothing_and_holds_nothing() {
+        let (folder, store) = store();
+        let blob = store.put(Bytes::from_static(b"twelve bytes")).await.unwrap();
+        assert!(!store.lacks(&blob).await);
+        assert!(store.lacks(&Blob { size: 11, ..blob.clone() }).await);
+        assert!(store.lacks(&name(b"absent")).await);
+        assert!(store.lacks(&Blob { digest: "../up".into(), size: 1 }).await);
+        let (inside, aside) = (folder.path().join(&blob.digest[..2]), folder.path().join("aside"));
+        std::fs::rename(&inside, &aside).unwrap();
+        assert!(store.lacks(&blob).await);
+        // A folder that is a file is no answer, as an input or output error is none.
+        std::fs::write(&inside, b"").unwrap();
+        assert!(!store.lacks(&blob).await && !store.holds(&blob).await);
+        std::fs::remove_file(&inside).unwrap();
+        std::fs::rename(&aside, &inside).unwrap();
+        assert!(!store.lacks(&blob).await && store.holds(&blob).await);
     }
 
     #[tokio::test]

@@ -11,6 +11,7 @@ use std::{
     ops::Range,
 };
 
+use splat::formats::track_state::Shape;
 use trackersplat_proto::v1::{Blob, Failure, TrackFrame, TrackJob, TrackedField, Tracker};
 
 use crate::{failure::failure, queue::JobId};
@@ -41,6 +42,8 @@ pub(crate) struct TrackedView {
     pub(crate) name: String,
     /// Width and height of its images, and so of its fields.
     pub(crate) size: (u32, u32),
+    /// Width and height of the tracker's states; of a network's, the largest possible.
+    pub(crate) state_size: (u32, u32),
     pub(crate) key_image: Blob,
     /// In order of frames, those after the key frame.
     pub(crate) fields: Vec<Field>,
@@ -84,8 +87,52 @@ pub(crate) struct Field {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct StatePlace {
     pub(crate) key: String,
-    /// Places in the view of the frames that it may remember.
+    /// Places in the view of the frames that it remembers: all that the next window may be chained to.
     pub(crate) past: Range<usize>,
+    /// Its width and height; of a network's, the largest possible.
+    pub(crate) size: (u32, u32),
+    /// Whether a network tracks the view.
+    pub(crate) learned: bool,
+}
+
+impl StatePlace {
+    /// Refuses a state that does not belong here, before it is decompressed: with one that forgets frames, tracking would
+    /// go on to other fields.
+    pub(crate) fn check_shape(&self, found: Shape) -> Result<(), String> {
+        let Shape { width, height, frames } = found;
+        let needed = self.past.len();
+        // Networks that see the key frame remember nothing.
+        if frames == 0 && (self.learned || needed == 0) {
+            return Ok(());
+        }
+        if frames as usize != needed {
+            return Err(format!(
+                "the tracker's state remembers {frames} frames of the view, the next window needs {needed}"
+            ));
+        }
+        let (of_view, is_right) = match self.learned {
+            true => ("at most ", width <= self.size.0 && height <= self.size.1),
+            false => ("", (width, height) == self.size),
+        };
+        if !is_right {
+            let (columns, rows) = self.size;
+            return Err(format!(
+                "the tracker's state is of {width} x {height} pixels, the view's are of {of_view}{columns} x {rows}"
+            ));
+        }
+        Ok(())
+    }
+
+    /// Refuses a state of [the right shape](Self::check_shape) that remembers other frames.
+    pub(crate) fn check_frames(&self, found: &[usize]) -> Result<(), String> {
+        if found.is_empty() || found.iter().copied().eq(self.past.clone()) {
+            return Ok(());
+        }
+        let needed: Vec<usize> = self.past.clone().collect();
+        Err(format!(
+            "the tracker's state remembers the view's frames {found:?}, the next window needs {needed:?}"
+        ))
+    }
 }
 
 impl TrackedView {
@@ -235,7 +282,8 @@ impl TrackLedger {
         }
         let next = window.fields.end + 1;
         let past = next.saturating_sub(self.reach).max(1)..next;
-        Some(StatePlace { key: view.states.get(window.number)?.key.clone(), past })
+        let key = view.states.get(window.number)?.key.clone();
+        Some(StatePlace { key, past, size: view.state_size, learned: self.tracker.model.is_some() })
     }
 
     /// The state after the leased window of a view is there.
@@ -249,12 +297,20 @@ impl TrackLedger {
 
     /// A state is gone: what is tracked next begins before it.
     pub(crate) fn lose_state(&mut self, position: u32, key: &str) {
-        let states = self.views.get_mut(&position).map(|view| view.states.iter_mut());
-        let of_key = |state: &&mut State| state.key == key && state.blob.is_some();
-        for state in states.into_iter().flatten().filter(of_key) {
-            state.blob = None;
-            *self.lost.entry(position).or_default() += 1;
+        if self.drop_state(position, key) {
+            self.count_lost(position);
         }
+    }
+
+    /// Takes a state away that the store has not lost: what is tracked next begins before it. Whether there was one.
+    pub(crate) fn drop_state(&mut self, position: u32, key: &str) -> bool {
+        let mut states = self.views.get_mut(&position).into_iter().flat_map(|view| &mut view.states);
+        states.find(|state| state.key == key).is_some_and(|state| state.blob.take().is_some())
+    }
+
+    /// Counts a state that was lost, though it may never have been kept.
+    pub(crate) fn count_lost(&mut self, position: u32) {
+        *self.lost.entry(position).or_default() += 1;
     }
 
     /// States lost of a view since its last new field: many are a store that keeps none.
@@ -271,12 +327,13 @@ impl TrackLedger {
         superseded.map(|state| State { key: state.key.clone(), blob: state.blob.take() }).collect()
     }
 
-    /// Where a field belongs; `None` if this very field is there already. Refuses a frame that the job does not have, and
-    /// a second field that differs from the first: tracks are a function of the images and the tracker. Beside a field of
-    /// another job any other is left aside.
+    /// Where a field belongs; `None` if this very field is there already. Refuses a frame that the leased window does not
+    /// have, and a second field that differs from the first: tracks are a function of the images and the tracker. Beside a
+    /// field of another job any other is left aside.
     pub(crate) fn place(&self, position: u32, found: &TrackedField) -> Result<Option<Place>, String> {
-        let field = self.field(position, found.frame).ok_or_else(|| {
-            format!("tracks of view '{}' to frame {}: not of the job", self.name(position), found.frame)
+        let field = self.leased_field(position, found.frame).ok_or_else(|| {
+            let view = self.name(position);
+            format!("tracks of view '{view}' to frame {}: not of the window that is leased", found.frame)
         })?;
         let given = found.tracks.as_ref().ok_or("the worker's field names no blob")?;
         match &field.tracks {
@@ -316,6 +373,13 @@ impl TrackLedger {
         fields.find(|field| field.tracks.is_none()).map(|field| field.frame)
     }
 
+    /// Frames to which a view is not tracked, in order, with the keys of their fields.
+    pub(crate) fn missing_fields(&self, position: u32) -> Vec<(u32, String)> {
+        let fields = self.views.get(&position).map(|view| view.fields.as_slice()).unwrap_or_default();
+        let missing = fields.iter().filter(|field| field.tracks.is_none());
+        missing.map(|field| (field.frame, field.key.clone())).collect()
+    }
+
     /// The tracks of every view to a frame by position; `None` if any is missing. To the key frame there are none.
     pub(crate) fn at(&self, frame: u32) -> Option<BTreeMap<u32, Blob>> {
         if frame == self.key_frame {
@@ -348,7 +412,18 @@ impl TrackLedger {
     }
 
     fn field(&self, position: u32, frame: u32) -> Option<&Field> {
-        let fields = &self.views.get(&position)?.fields;
-        fields.binary_search_by_key(&frame, |field| field.frame).ok().map(|index| &fields[index])
+        let index = self.index(position, frame)?;
+        self.views.get(&position)?.fields.get(index)
+    }
+
+    /// The field to a frame of the leased window.
+    fn leased_field(&self, position: u32, frame: u32) -> Option<&Field> {
+        let index = self.index(position, frame)?;
+        let is_leased = self.leased.get(&position)?.fields.contains(&index);
+        self.views.get(&position)?.fields.get(index).filter(|_| is_leased)
+    }
+
+    fn index(&self, position: u32, frame: u32) -> Option<usize> {
+        self.views.get(&position)?.fields.binary_search_by_key(&frame, |field| field.frame).ok()
     }
 }

@@ -133,7 +133,8 @@ async fn open_directory(welcome: &Welcome) -> Option<Blobs> {
     if welcome.store_directory.is_empty() || !FilePath::new(&welcome.store_directory).is_dir() {
         return None;
     }
-    let store = LocalFileSystem::new_with_prefix(&welcome.store_directory).ok()?;
+    // What the coordinator acknowledges survives, power loss included: its own writes are synced as well.
+    let store = LocalFileSystem::new_with_prefix(&welcome.store_directory).ok()?.with_fsync(true);
     let directory = Blobs::Directory(std::sync::Arc::new(store));
     directory.get(probe).await.is_ok().then_some(directory)
 }
@@ -234,7 +235,10 @@ mod tests {
             store_probe: Some(blob(b"probe")),
             ..Welcome::default()
         };
-        assert!(matches!(Blobs::open(&welcome, coordinator.channel()).await, Blobs::Directory(_)));
+        let opened = Blobs::open(&welcome, coordinator.channel()).await;
+        let Blobs::Directory(store) = opened else { panic!("{opened:?}") };
+        // All that the store says of it.
+        assert!(format!("{store:?}").contains("fsync: true"), "{store:?}");
         welcome.store_probe = Some(blob(b"another store's probe"));
         assert!(matches!(Blobs::open(&welcome, coordinator.channel()).await, Blobs::Coordinator(_)));
     }

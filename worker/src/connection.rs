@@ -129,13 +129,14 @@ pub(crate) fn channel(coordinator: &str) -> Result<Channel, WorkerError> {
         .connect_lazy())
 }
 
-/// Delays between attempts: doubling from 0.1 s to 2 s, each with jitter, `total` together.
+/// Delays between attempts: doubling from 0.1 s to 1 s, each with jitter of up to itself, `total` together. So whoever waits
+/// for a coordinator is back well before its `--reconnect-grace` of 3 s is over.
 ///
 /// `seed` differs between workers, so that they do not all come back at the same moment.
 pub(crate) fn backoff(total: Duration, seed: u64) -> ExponentialBuilder {
     ExponentialBuilder::new()
         .with_min_delay(Duration::from_millis(100))
-        .with_max_delay(Duration::from_secs(2))
+        .with_max_delay(Duration::from_secs(1))
         .with_jitter()
         .with_jitter_seed(seed)
         .without_max_times()
@@ -218,7 +219,7 @@ mod tests {
         let delays = |seed| backoff(total, seed).build().collect::<Vec<_>>();
         assert_ne!(delays(1), delays(2));
         assert!(delays(1).iter().sum::<Duration>() <= total);
-        assert!(delays(1).iter().all(|delay| *delay <= Duration::from_secs(4)));
+        assert!(delays(1).iter().all(|delay| *delay <= Duration::from_secs(2)));
     }
 
     #[test]

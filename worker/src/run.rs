@@ -423,8 +423,8 @@ enum Step {
     Ended(Option<Outcome>),
 }
 
-/// The next step of the running lease; never ready without one. Fields that are not yet said when the task ends are in
-/// its outcome.
+/// The next step of the running lease; never ready without one. Fields that are not yet said when the task ends well are in
+/// its outcome; those of one that failed are made again.
 async fn next_step(running: &mut Option<RunningLease>, field_room: &Arc<Semaphore>) -> Step {
     let Some(running) = running else { return pending().await };
     let ended = tokio::select! {

@@ -20,8 +20,8 @@ use tokio::{
 use tokio_util::sync::CancellationToken;
 use trackersplat_proto::v1::{self, Blob, FailureKind, TrackFrame, TrackJob, TrackedField};
 
-use super::Job;
-use crate::{compute::go_on, failure::StageError, hub::Hub, queue::Lease};
+use super::{Job, patience::patiently};
+use crate::{blobs::BlobError, compute::go_on, failure::StageError, hub::Hub, queue::Lease};
 
 impl Job {
     /// Tracks views whenever no connected worker may, until nobody has a view to track any more.
@@ -105,13 +105,16 @@ impl Job {
     }
 
     async fn tracker(&self, wanted: v1::Tracker) -> Result<Arc<Tracker>, StageError> {
-        let bytes = match &wanted.model {
-            Some(blob) => Some(self.hub.blobs.get(blob).await?.to_vec()),
-            None => None,
-        };
-        let settings = self.settings.clone();
+        let (hub, stop, settings) = (self.hub.clone(), self.stop.clone(), self.settings.clone());
+        let runtime = Handle::current();
         let load = move || -> Result<_, StageError> {
-            let model = bytes.map(|bytes| (bytes, wanted.model_name.as_str()));
+            let model = match &wanted.model {
+                Some(blob) => {
+                    let got = runtime.block_on(patiently(&stop, |_| true, || hub.blobs.get(blob)))?;
+                    Some((got.to_vec(), wanted.model_name.as_str()))
+                }
+                None => None,
+            };
             Ok(Arc::new(Tracker::new(model, &settings.tracking)?))
         };
         self.hub.compute.run(load).await
@@ -152,13 +155,25 @@ impl OwnTracking {
             return Ok(None);
         }
         let encoded = Bytes::from(track_state::encode(&after));
-        Ok(Some(self.runtime.block_on(self.hub.blobs.put(encoded))?))
+        Ok(Some(self.transfer(|| self.hub.blobs.put(encoded.clone()))?))
+    }
+
+    /// Waits for a transfer with the store, which may fail for a while.
+    fn transfer<T, F: Future<Output = Result<T, BlobError>>>(
+        &self,
+        transfer: impl FnMut() -> F,
+    ) -> Result<T, StageError> {
+        self.runtime.block_on(patiently(&self.stop, |_| true, transfer))
     }
 
     /// What tracking goes on from.
     fn state(&self) -> Result<TrackState, StageError> {
         let Some(blob) = &self.request.state else { return Ok(TrackState::default()) };
-        let bytes = self.runtime.block_on(self.hub.blobs.get(blob))?;
+        // What is gone from the store does not come back: the window before is leased.
+        let may_pass =
+            |error: &BlobError| !matches!(error, BlobError::Missing(_) | BlobError::Corrupt { .. });
+        let got = patiently(&self.stop, may_pass, || self.hub.blobs.get(blob));
+        let bytes = self.runtime.block_on(got)?;
         track_state::decode(&bytes).map_err(|error| {
             let message = format!("the tracker's state of view '{}': {error}", self.request.view);
             StageError::new(FailureKind::Bug, message)
@@ -174,7 +189,8 @@ impl OwnTracking {
 
     fn load(&self, place: usize) -> Result<Arc<Image>, StageError> {
         let frame = self.frame(place)?;
-        let bytes = self.runtime.block_on(self.hub.blobs.get(&frame.image.clone().unwrap_or_default()))?;
+        let blob = frame.image.clone().unwrap_or_default();
+        let bytes = self.transfer(|| self.hub.blobs.get(&blob))?;
         let image = Image::decode(&bytes).map_err(|error| {
             let view = &self.request.view;
             StageError::bad_input(format!("image of view '{view}' at frame {}: {error}", frame.frame))
@@ -190,9 +206,8 @@ impl OwnTracking {
             return Ok(());
         }
         let encoded = Bytes::from(track_blob::encode(field));
-        self.runtime.block_on(async {
-            let tracks = Some(self.hub.blobs.put(encoded).await?);
-            self.hub.own_field(&self.lease, TrackedField { frame: frame.frame, tracks }).await
-        })
+        let tracks = Some(self.transfer(|| self.hub.blobs.put(encoded.clone()))?);
+        let field = TrackedField { frame: frame.frame, tracks };
+        self.runtime.block_on(self.hub.own_field(&self.lease, field))
     }
 }

@@ -8,6 +8,7 @@ mod assemble;
 mod frames;
 mod imported;
 mod ingest;
+mod patience;
 mod progress;
 mod static_model;
 mod tracks;

@@ -158,6 +158,11 @@ impl Job {
             StageError::new(FailureKind::Transient, message)
         })?;
         let size = (view.camera.width, view.camera.height);
+        let state_size = match tracker.model {
+            // At which resolution a network sees the images only it knows.
+            Some(_) => size,
+            None => self.settings.tracking.matched_size(size.0, size.1),
+        };
         let window = self.window(size);
         let (mut fields, mut states) = (Vec::new(), Vec::new());
         let last = images.len();
@@ -186,7 +191,7 @@ impl Job {
                 states.push(State { key, blob });
             }
         }
-        Ok(TrackedView { name: view.name.clone(), size, key_image, fields, window, states })
+        Ok(TrackedView { name: view.name.clone(), size, state_size, key_image, fields, window, states })
     }
 
     /// Frames per lease of views of a size. Views whose states would be too large for a blob are not cut.

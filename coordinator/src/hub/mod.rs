@@ -4,6 +4,7 @@
 //! only then told to workers and clients. If the database fails, the coordinator ends: after a restart it goes on from
 //! what is written.
 
+mod fields;
 mod frames;
 mod jobs;
 mod reports;

@@ -80,7 +80,7 @@ impl Hub {
         self.dispatch(&mut desk).await
     }
 
-    /// The verification of this stream's report ended in a panic: the attempt has failed.
+    /// The verification of this stream's report, or field, ended in a panic: the attempt has failed.
     pub(crate) async fn report_panicked(&self, session: SessionId) -> Result<(), StoreError> {
         let mut desk = self.desk.lock().await;
         let Some(failed) = desk.queue.abandon_report(session) else { return Ok(()) };
@@ -102,9 +102,7 @@ impl Hub {
             Ok(failed) => {
                 let unusable = desk.lose_unusable_state(&failed.lease, reason.kind());
                 self.record_failed(&mut desk, &failed, &reason).await?;
-                let nameless = self.forget_states(unusable.as_slice()).await?;
-                drop(desk);
-                self.remove_blobs(&nameless).await;
+                self.forget_states(unusable.as_slice()).await?;
                 Ok(None)
             }
             Err(stale) => Ok(Some(stale.to_string())),
@@ -214,15 +212,7 @@ impl Hub {
 
     /// The verified bytes of a blob that a result names.
     pub(super) async fn fetched(&self, blob: &Blob, what: &str) -> Result<bytes::Bytes, Failure> {
-        self.blobs.get(blob).await.map_err(|error| {
-            let kind = match &error {
-                BlobError::Name(_) | BlobError::TooLarge { .. } => FailureKind::Bug,
-                BlobError::Missing(_) | BlobError::Corrupt { .. } | BlobError::Store(_) => {
-                    FailureKind::Transient
-                }
-            };
-            failure(kind, format!("{what}: {error}"))
-        })
+        self.blobs.get(blob).await.map_err(|error| unfetched(&error, what))
     }
 
     /// Checks a delta against the static model and writes the frame's file into the output folder.
@@ -255,6 +245,15 @@ impl Hub {
             Err(FrameError::Result(failure(FailureKind::Bug, message)))
         })
     }
+}
+
+/// What follows for a result from a blob of it that cannot be read.
+pub(super) fn unfetched(error: &BlobError, what: &str) -> Failure {
+    let kind = match error {
+        BlobError::Name(_) | BlobError::TooLarge { .. } => FailureKind::Bug,
+        BlobError::Missing(_) | BlobError::Corrupt { .. } | BlobError::Store(_) => FailureKind::Transient,
+    };
+    failure(kind, format!("{what}: {error}"))
 }
 
 /// Why the worker gave the frame up.

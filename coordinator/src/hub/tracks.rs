@@ -1,28 +1,23 @@
-//! Tracks of views: given out window by window, reported field by field, complete.
+//! Tracks of views: given out window by window, reported, complete.
 
 use std::time::Instant;
 
-use splat::formats::track_blob;
 use tokio_util::sync::CancellationToken;
-use trackersplat_proto::v1::{
-    Blob, CancelLease, Failure, FailureKind, FieldReport, TrackJob, Tracked, TrackedField,
-    coordinator_message::Message,
-};
+use trackersplat_proto::v1::{Blob, Failure, FailureKind, TrackJob, Tracked};
 
-use super::{Desk, Hub};
+use super::{
+    Desk, Hub,
+    windows::{MAX_LOST_STATES, StateFault, keeps_no_state},
+};
 use crate::{
     failure::{StageError, failure},
-    ledger::{Place, State, TrackLedger},
+    ledger::{State, TrackLedger},
     queue::{
-        JobId, Lease, SessionId, Task, TaskHistory, TaskKey,
+        JobId, Lease, Task, TaskHistory, TaskKey,
         task::{TaskState, TaskTrigger},
     },
-    store::{Artifact, AttemptOutcome, StoreError, TaskEvent, TaskRecord},
+    store::{AttemptOutcome, StoreError, TaskEvent, TaskRecord},
 };
-
-/// States lost of a view without a new field from which on every window of it counts as failed: a store that keeps none
-/// would have the view tracked again for ever.
-const MAX_LOST_STATES: u32 = 3;
 
 impl Hub {
     /// What is known of a job's tracks from now on; views that lack fields become ready for workers.
@@ -56,11 +51,8 @@ impl Hub {
         for position in missing {
             self.publish_tracks(&mut desk, job, position).await?;
         }
-        let nameless = self.forget_states(&superseded).await?;
-        self.dispatch(&mut desk).await?;
-        drop(desk);
-        self.remove_blobs(&nameless).await;
-        Ok(())
+        self.forget_states(&superseded).await?;
+        Ok(self.dispatch(&mut desk).await?)
     }
 
     /// Whether views have become ready in this run of the job.
@@ -170,19 +162,15 @@ impl Hub {
         job: &JobId,
         position: u32,
     ) -> Result<Option<TrackJob>, StoreError> {
+        self.adopt_fields(desk, job, position).await?;
         let Some(ledger) = desk.ledger_mut(job) else { return Ok(None) };
         while let Some(State { key, blob: Some(blob) }) = ledger.next_state(position)
-            && !self.blobs.holds(&blob).await
+            && self.blobs.lacks(&blob).await
         {
             tracing::warn!(job_id = %job, position, "the tracker's state is gone from the store");
             ledger.lose_state(position, &key);
         }
         Ok(ledger.lease(position))
-    }
-
-    /// The coordinator has made a field under its own lease.
-    pub(crate) async fn own_field(&self, lease: &Lease, field: TrackedField) -> Result<(), StageError> {
-        self.keep_field(lease, &field).await?.map_err(StageError::Failed)
     }
 
     /// The coordinator's own lease has ended, well with the state after it if that is wanted.
@@ -202,33 +190,6 @@ impl Hub {
         Ok(self.dispatch(&mut desk).await?)
     }
 
-    /// A worker has stored a field. It is a sign of life as well; a worker that works on a lease it no longer holds, or
-    /// whose field does not verify, is told to stop.
-    pub(crate) async fn field_reported(
-        &self,
-        session: SessionId,
-        report: FieldReport,
-    ) -> Result<(), StoreError> {
-        let FieldReport { lease_id, attempt, field } = report;
-        let held = {
-            let mut desk = self.desk.lock().await;
-            desk.queue.heartbeat(session, &lease_id, attempt, Instant::now()).cloned()
-        };
-        let reason = match held {
-            Err(stale) => stale.to_string(),
-            Ok(lease) => match self.keep_field(&lease, &field.unwrap_or_default()).await? {
-                Ok(()) => return Ok(()),
-                Err(reason) => {
-                    let message = reason.message.clone();
-                    self.failed(&lease_id, attempt, reason).await?.unwrap_or(message)
-                }
-            },
-        };
-        let mut desk = self.desk.lock().await;
-        desk.send(session, Message::CancelLease(CancelLease { lease_id, reason }));
-        self.dispatch(&mut desk).await
-    }
-
     /// `None` if the window of the lease is complete, else why its tracks do not count.
     pub(super) async fn tracked(
         &self,
@@ -241,9 +202,12 @@ impl Hub {
             }
         }
         if let Some(state) = &tracked.state
-            && let Err(reason) = self.keep_state(lease, state).await?
+            && let Err(fault) = self.keep_state(lease, state).await?
         {
-            return self.refused(&lease.id, lease.attempt, reason).await;
+            return match fault {
+                StateFault::Gone => self.reported_state_gone(lease).await,
+                StateFault::Refused(reason) => self.refused(&lease.id, lease.attempt, reason).await,
+            };
         }
         let position = lease.key.task.number();
         let mut desk = self.desk.lock().await;
@@ -256,11 +220,7 @@ impl Hub {
         let next = ledger.and_then(|ledger| ledger.missing(position).map(|_| ledger.before(position)));
         if next.is_some() && ledger.is_some_and(|ledger| ledger.lost_states(position) >= MAX_LOST_STATES) {
             drop(desk);
-            let message = format!(
-                "the store has lost {MAX_LOST_STATES} of the tracker's states without a new field; check its disk"
-            );
-            let reason = failure(FailureKind::Transient, message);
-            return self.refused(&lease.id, lease.attempt, reason).await;
+            return self.refused(&lease.id, lease.attempt, keeps_no_state()).await;
         }
         let ended = match next {
             Some(before) => desk.queue.go_on(&lease.id, lease.attempt, before),
@@ -276,9 +236,7 @@ impl Hub {
         }
         let ledger = desk.ledger_mut(&lease.key.job);
         let superseded = ledger.map(|ledger| ledger.take_superseded(position));
-        let nameless = self.forget_states(&superseded.unwrap_or_default()).await?;
-        drop(desk);
-        self.remove_blobs(&nameless).await;
+        self.forget_states(&superseded.unwrap_or_default()).await?;
         Ok(None)
     }
 
@@ -306,77 +264,6 @@ impl Hub {
         desk.changed(job);
         Ok(())
     }
-
-    /// Verifies a field and keeps it, unless it is there already or its lease has ended meanwhile. `Err`: the attempt has
-    /// failed, and why.
-    async fn keep_field(
-        &self,
-        lease: &Lease,
-        field: &TrackedField,
-    ) -> Result<Result<(), Failure>, StoreError> {
-        let (job, position) = (&lease.key.job, lease.key.task.number());
-        let placed = {
-            let desk = self.desk.lock().await;
-            desk.placed(job, position, field)
-        };
-        let (place, blob) = match placed {
-            Ok(Some(place)) => (place, field.tracks.clone().unwrap_or_default()),
-            Ok(None) => return Ok(Ok(())),
-            Err(reason) => return Ok(Err(reason)),
-        };
-        if let Err(reason) = self.verify_field(&blob, place.size).await {
-            return Ok(Err(reason));
-        }
-        let mut desk = self.desk.lock().await;
-        // What has changed while the field was verified counts: the lease may be another worker's by now.
-        match (desk.queue.check(&lease.id, lease.attempt), desk.placed(job, position, field)) {
-            (Ok(()), Ok(Some(_))) => {}
-            (Ok(()), Err(reason)) => return Ok(Err(reason)),
-            (Ok(()), Ok(None)) | (Err(_), _) => return Ok(Ok(())),
-        }
-        let known = self.held_field(&place.key).await?;
-        let mut change = self.store.change().await?;
-        if known.is_none() {
-            let artifact = Artifact { blob: blob.clone(), note: String::new() };
-            change.put_artifact(&place.key, "tracks", &artifact).await?;
-        }
-        change.forget_failures(&lease.key).await?;
-        change.commit().await?;
-        desk.queue.progressed(&lease.key);
-        if let Some(ledger) = desk.ledger_mut(job) {
-            match known.filter(|known| *known != blob) {
-                Some(known) => ledger.adopt(position, field.frame, known),
-                None => ledger.keep(position, field),
-            }
-            let (done, total) = ledger.counts();
-            self.progress(job, "tracking", done, total);
-        }
-        desk.changed(job);
-        Ok(Ok(()))
-    }
-
-    /// The field of this key that another job of the same clip has made meanwhile.
-    async fn held_field(&self, key: &str) -> Result<Option<Blob>, StoreError> {
-        let Some(Artifact { blob, .. }) = self.store.artifact(key).await? else { return Ok(None) };
-        Ok(self.blobs.holds(&blob).await.then_some(blob))
-    }
-
-    /// The field is what its name says, readable, and of the size of the view.
-    async fn verify_field(&self, blob: &Blob, (width, height): (u32, u32)) -> Result<(), Failure> {
-        let bug = |message: String| failure(FailureKind::Bug, message);
-        let bytes = self.fetched(blob, "the worker's tracks").await?;
-        let decoded = tokio::task::spawn_blocking(move || track_blob::decode(&bytes)).await;
-        let field = decoded
-            .map_err(|error| bug(format!("reading the worker's tracks: {error}")))?
-            .map_err(|error| bug(format!("the worker's tracks: {error}")))?;
-        if (field.width, field.height) != (width, height) {
-            return Err(bug(format!(
-                "the worker's tracks are of {} x {} pixels, the view of {width} x {height}",
-                field.width, field.height
-            )));
-        }
-        Ok(())
-    }
 }
 
 impl Desk {
@@ -386,13 +273,6 @@ impl Desk {
 
     pub(super) fn ledger_mut(&mut self, job: &JobId) -> Option<&mut TrackLedger> {
         self.active.get_mut(job)?.tracks.as_mut()
-    }
-
-    fn placed(&self, job: &JobId, position: u32, field: &TrackedField) -> Result<Option<Place>, Failure> {
-        let ledger = self.ledger(job);
-        let ledger =
-            ledger.ok_or_else(|| failure(FailureKind::Transient, "the job is not ready for results"))?;
-        ledger.place(position, field).map_err(|message| failure(FailureKind::Bug, message))
     }
 
     /// Name of a tracked view; empty if nothing is known of it.

@@ -23,6 +23,7 @@ fn ledger() -> TrackLedger {
     let view = |name: &str| TrackedView {
         name: name.into(),
         size: (8, 6),
+        state_size: (4, 3),
         key_image: blob("image-3"),
         fields: vec![field(4), field(6)],
         window: 16,
@@ -49,6 +50,8 @@ fn a_frame_is_tracked_once_every_view_is() {
 #[test]
 fn the_first_field_counts_and_another_one_is_a_defect() {
     let mut ledger = ledger();
+    assert!(ledger.place(0, &found(4, "a")).is_err(), "nobody has a lease");
+    ledger.lease(0).unwrap();
     let place = Place { key: "key-4".into(), size: (8, 6) };
     assert_eq!(ledger.place(0, &found(4, "a")), Ok(Some(place)));
     ledger.keep(0, &found(4, "a"));
@@ -102,6 +105,7 @@ fn in_windows_of(window: usize, reach: usize) -> TrackLedger {
     let view = TrackedView {
         name: "cam00".into(),
         size: (8, 6),
+        state_size: (4, 3),
         key_image: blob("image-10"),
         fields: (11..=16).map(field).collect(),
         window,
@@ -135,7 +139,8 @@ fn windows_follow_each_other_by_their_states() {
     assert_eq!(ledger.lacks(0).unwrap(), "the tracks to frame 11");
     keep_leased(&mut ledger, &first, None);
     assert!(ledger.lacks(0).unwrap().contains("state"));
-    assert_eq!(ledger.state_place(0), Some(StatePlace { key: "state-0".into(), past: 1..3 }));
+    let place = StatePlace { key: "state-0".into(), past: 1..3, size: (4, 3), learned: false };
+    assert_eq!(ledger.state_place(0), Some(place));
     keep_leased(&mut ledger, &first, Some("a"));
     assert_eq!((ledger.lacks(0), ledger.state_place(0), ledger.before(0)), (None, None, 11));
 
@@ -182,6 +187,70 @@ fn a_view_that_lacks_its_report_only_is_leased_with_an_empty_window() {
     assert_eq!((numbers(&job.frames), job.window().len(), job.past.len()), (vec![10], 0, 0));
     assert_eq!((job.state, job.wants_state), (None, false));
     assert_eq!((ledger.lacks(0), ledger.state_place(0), ledger.leased_state(0)), (None, None, None));
+}
+
+#[test]
+fn only_fields_of_the_leased_window_are_placed() {
+    let mut ledger = in_windows(1);
+    for (window, state) in [([11, 12], "a"), ([13, 14], "b"), ([15, 16], "none")] {
+        let job = ledger.lease(0).unwrap();
+        for frame in 11..=16 {
+            let placed = ledger.place(0, &found(frame, "field"));
+            assert_eq!(placed.is_ok(), window.contains(&frame), "{window:?} {frame}");
+        }
+        keep_leased(&mut ledger, &job, Some(state));
+    }
+    let message = ledger.place(0, &found(11, "field")).unwrap_err();
+    assert!(message.contains("frame 11: not of the window that is leased"), "{message}");
+}
+
+fn place(past: Range<usize>, learned: bool) -> StatePlace {
+    StatePlace { key: "state".into(), past, size: (4, 3), learned }
+}
+
+#[test]
+fn a_state_has_the_size_at_which_frames_are_matched_and_every_frame_that_is_needed() {
+    let shape = |width, height, frames| Shape { width, height, frames };
+    let refused = |learned, found| place(3..5, learned).check_shape(found).err().unwrap_or_default();
+    for learned in [false, true] {
+        assert_eq!(refused(learned, shape(4, 3, 2)), "");
+        assert!(
+            refused(learned, shape(4, 3, 1))
+                .contains("remembers 1 frames of the view, the next window needs 2")
+        );
+        assert!(refused(learned, shape(4, 3, 3)).contains("needs 2"));
+        assert!(refused(learned, shape(8, 6, 2)).contains("8 x 6 pixels"));
+    }
+    assert!(refused(false, shape(0, 0, 0)).contains("remembers 0 frames"));
+    assert!(refused(false, shape(4, 2, 2)).contains("are of 4 x 3"));
+    assert_eq!((refused(true, shape(0, 0, 0)), refused(true, shape(4, 2, 2))), Default::default());
+    assert_eq!(place(3..3, false).check_shape(shape(0, 0, 0)), Ok(()), "nothing is chained");
+
+    assert_eq!(place(3..5, false).check_frames(&[3, 4]), Ok(()));
+    for other in [[2, 3], [3, 5]] {
+        let message = place(3..5, false).check_frames(&other).unwrap_err();
+        assert!(message.contains(&format!("{other:?}")) && message.contains("[3, 4]"), "{message}");
+    }
+}
+
+#[test]
+fn fields_that_are_missing_are_known_by_their_keys() {
+    let mut ledger = ledger();
+    let key = |frame: u32| (frame, format!("key-{frame}"));
+    assert_eq!(ledger.missing_fields(0), [key(4), key(6)]);
+    ledger.keep(0, &found(4, "a"));
+    assert_eq!((ledger.missing_fields(0), ledger.missing_fields(1)), (vec![key(6)], vec![]));
+}
+
+#[test]
+fn a_state_that_the_store_kept_well_is_not_counted_as_lost() {
+    let mut ledger = in_windows(1);
+    let job = ledger.lease(0).unwrap();
+    keep_leased(&mut ledger, &job, Some("a"));
+    assert!(ledger.drop_state(0, "state-0") && !ledger.drop_state(0, "state-0"));
+    assert_eq!((ledger.next_state(0), ledger.lost_states(0)), (None, 0));
+    ledger.count_lost(0);
+    assert_eq!(ledger.lost_states(0), 1);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Leases, how they end, and why a message about one has no effect.
 
-use std::time::Instant;
+use std::{collections::BTreeSet, time::Instant};
 
 use super::{SessionId, TaskKey};
 
@@ -25,11 +25,17 @@ pub struct Lease {
     pub deadline: Instant,
     /// The stream whose report is being verified; it does not expire meanwhile.
     pub(super) reporting: Option<SessionId>,
+    /// The streams whose fields are being verified; it does not expire meanwhile.
+    pub(super) saying: BTreeSet<SessionId>,
 }
 
 impl Lease {
     pub(super) fn may_expire(&self) -> bool {
-        self.session != SessionId::OWN && self.reporting.is_none()
+        self.session != SessionId::OWN && self.reporting.is_none() && self.saying.is_empty()
+    }
+
+    pub(super) fn is_verified_for(&self, session: SessionId) -> bool {
+        self.reporting == Some(session) || self.saying.contains(&session)
     }
 }
 

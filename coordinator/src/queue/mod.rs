@@ -7,6 +7,7 @@
 mod counts;
 pub mod job;
 mod lease;
+mod reporting;
 pub mod retry;
 pub mod task;
 #[cfg(test)]
@@ -274,6 +275,7 @@ impl Queue {
             since: now,
             deadline: now + self.policy.lease_duration,
             reporting: None,
+            saying: BTreeSet::new(),
         };
         self.leases.insert(id, lease.clone());
         Some(lease)
@@ -305,42 +307,6 @@ impl Queue {
         is_unburdened(worker_id) || !self.sessions.values().any(|session| is_unburdened(&session.worker_id))
     }
 
-    /// A sign of life for a lease.
-    pub fn heartbeat(
-        &mut self,
-        session: SessionId,
-        lease_id: &str,
-        attempt: u32,
-        now: Instant,
-    ) -> Result<&Lease, Stale> {
-        let deadline = now + self.policy.lease_duration;
-        let lease = self.held(session, lease_id, attempt)?;
-        lease.deadline = deadline;
-        Ok(lease)
-    }
-
-    /// A report has arrived: the lease does not expire while it is verified, whatever becomes of the stream. `None` if
-    /// an earlier report of it is being verified: this one is to be left alone.
-    pub fn begin_report(
-        &mut self,
-        session: SessionId,
-        lease_id: &str,
-        attempt: u32,
-    ) -> Result<Option<&Lease>, Stale> {
-        let lease = self.held(session, lease_id, attempt)?;
-        if lease.reporting.is_some() {
-            return Ok(None);
-        }
-        lease.reporting = Some(session);
-        Ok(Some(lease))
-    }
-
-    /// Nobody verifies the report of this stream any more: the attempt has failed, whoever holds the lease by now.
-    pub fn abandon_report(&mut self, session: SessionId) -> Option<FailedLease> {
-        let abandoned = self.leases.values().find(|lease| lease.reporting == Some(session))?.id.clone();
-        self.end_failed(&abandoned, FailureKind::Bug)
-    }
-
     /// The verified result counts: the task is closed.
     pub fn commit(&mut self, lease_id: &str, attempt: u32) -> Result<Lease, Stale> {
         self.in_force(lease_id, attempt)?;
@@ -368,10 +334,12 @@ impl Queue {
         }
     }
 
-    /// A part of the task's result is kept: whatever failed before, the task gets on, and has all its attempts again.
+    /// A part of the task's result is kept: whatever failed before, the task gets on, has all its attempts again, and
+    /// those that were lost with it are as welcome as others.
     pub fn progressed(&mut self, key: &TaskKey) {
         if let Some(task) = self.tasks.get_mut(key) {
             task.history.failures = 0;
+            task.avoided.clear();
         }
     }
 

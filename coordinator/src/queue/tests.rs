@@ -185,6 +185,45 @@ fn a_lease_does_not_expire_while_its_result_is_verified() {
 }
 
 #[test]
+fn a_lease_does_not_expire_while_a_field_of_it_is_verified_nor_before_a_heartbeat_can_be_read() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    let (begun, ended) = (bench.now, bench.now + 10 * LEASE);
+    assert!(bench.queue.begin_field(session, &lease.id, 1, begun).is_ok());
+    assert_eq!(bench.queue.expire(ended), []);
+    bench.queue.end_field(session, &lease.id, ended);
+    assert_eq!(bench.queue.expire(ended + LEASE - Duration::from_millis(1)), []);
+    assert_eq!(bench.queue.expire(ended + LEASE).len(), 1);
+    assert!(bench.queue.begin_field(session, &lease.id, 1, ended).is_err());
+}
+
+#[test]
+fn a_field_that_nobody_verifies_any_more_is_a_failed_attempt() {
+    let mut bench = Bench::new([1]);
+    let session = bench.connect(1, "w");
+    let lease = bench.assign_one();
+    assert!(bench.queue.begin_field(session, &lease.id, 1, bench.now).is_ok());
+    let failed = bench.queue.abandon_report(session).expect("its field was being verified");
+    assert!(failed.retried && failed.lease.id == lease.id);
+}
+
+#[test]
+fn who_was_lost_with_a_task_is_as_welcome_as_others_once_it_gets_on() {
+    let mut bench = Bench::new([1]);
+    let lost = bench.connect(1, "a");
+    bench.assign_one();
+    bench.lose(lost);
+    let heir = bench.connect(2, "b");
+    let lease = bench.assign_one();
+    bench.queue.progressed(&lease.key);
+    bench.queue.go_on(&lease.id, lease.attempt, 0).expect("held");
+    bench.connect(3, "a");
+    bench.queue.park(heir);
+    assert_eq!(bench.assign_one().worker_id, "a", "it asked first");
+}
+
+#[test]
 fn a_frame_fails_for_good_after_three_failed_attempts() {
     let mut bench = Bench::new([1]);
     bench.connect(1, "w");

@@ -21,10 +21,10 @@ impl Store {
         Ok(row.map(|(digest, size, note)| Artifact { blob: Blob { digest, size: unsigned(size) }, note }))
     }
 
-    /// Whether a blob is the content of any artifact.
-    pub async fn is_artifact(&self, blob: &Blob) -> Result<bool, StoreError> {
-        let sql = "SELECT EXISTS (SELECT 1 FROM artifacts WHERE digest = ?)";
-        Ok(sqlx::query_scalar(sql).bind(&blob.digest).fetch_one(&self.pool).await?)
+    /// Keys of the artifacts whose content a blob is.
+    pub async fn artifact_keys(&self, blob: &Blob) -> Result<Vec<String>, StoreError> {
+        let query = sqlx::query_scalar("SELECT key FROM artifacts WHERE digest = ?").bind(&blob.digest);
+        Ok(query.fetch_all(&self.pool).await?)
     }
 }
 

@@ -93,8 +93,13 @@ fn network(motion: [f32; 2]) -> Vec<u8> {
 
 /// A submission with the network in `file`.
 fn submission(bench: &Bench, file: &str) -> SubmitRequest {
+    submission_in(bench, file, 16)
+}
+
+/// [`submission`] in windows of so many frames.
+fn submission_in(bench: &Bench, file: &str, window: u32) -> SubmitRequest {
     SubmitRequest {
-        settings_json: r#"{"tracking": {"onnx": {"multiple": 1}}}"#.into(),
+        settings_json: format!(r#"{{"tracking": {{"window": {window}, "onnx": {{"multiple": 1}}}}}}"#),
         tracks: Some(Tracks::TrackerModel(bench.path(file))),
         ..bench.request()
     }
@@ -130,6 +135,31 @@ async fn a_network_tracks_in_place_of_the_built_in_tracker() {
             assert_eq!(field.positions[index], [4.5 + motion[0], 3.5 + motion[1]], "{file}");
         }
     }
+}
+
+#[tokio::test]
+async fn a_network_tracks_in_windows_to_the_same_fields() {
+    let mut found = Vec::new();
+    for (window, leases) in [(16, 1), (1, 2)] {
+        let bench = Bench::start().await;
+        std::fs::write(bench.path("net.onnx"), network([1.5, -0.5])).unwrap();
+        let job = bench.submit(submission_in(&bench, "net.onnx", window)).await.unwrap().job_id;
+        let mut attempts = 0;
+        let mut watch = bench.watch(&job, 0).await;
+        watch
+            .until(|event| {
+                if let Event::TracksState(tracks) = event {
+                    assert!(tracks.failure.is_none(), "{tracks:?}");
+                    attempts = attempts.max(tracks.attempt);
+                }
+                matches!(event, Event::JobState(s) if s.state() == JobState::Frames)
+            })
+            .await;
+        assert_eq!(attempts, leases, "what remembers nothing is a state as well");
+        let fields = |ledger: &crate::ledger::TrackLedger| (ledger.at(2), ledger.at(3));
+        found.push(bench.hub().tracks(&job.as_str().into(), fields).await.unwrap());
+    }
+    assert!(found[0] == found[1] && found[0].1.is_some());
 }
 
 #[tokio::test]

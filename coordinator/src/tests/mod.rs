@@ -1,6 +1,7 @@
 //! The coordinator over loopback, with workers that speak the protocol by hand.
 
 mod early_tracks;
+mod handover;
 mod harness;
 mod jobs;
 mod learned;
@@ -11,6 +12,7 @@ mod remote_clips;
 mod reports;
 mod restart;
 mod runs;
+mod states;
 mod track_files;
 mod tracks;
 mod transfers;

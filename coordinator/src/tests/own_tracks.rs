@@ -6,7 +6,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use trackersplat_proto::v1::{CancelRequest, FailureKind, JobState, TaskState, job_event::Event};
+use trackersplat_proto::v1::{
+    CancelRequest, FailureKind, JobState, SubmitRequest, TaskState, job_event::Event,
+};
 
 use super::{
     harness::*,
@@ -35,9 +37,17 @@ async fn occupy(bench: &Bench) -> mpsc::Sender<()> {
 
 /// A job in which the coordinator holds the lease of cam00 and waits for its thread.
 async fn tracking_alone(bench: &Bench) -> (String, Watch, mpsc::Sender<()>) {
+    tracking_alone_on(bench, tracked_request(bench)).await
+}
+
+/// [`tracking_alone`] on any submission.
+pub(super) async fn tracking_alone_on(
+    bench: &Bench,
+    request: SubmitRequest,
+) -> (String, Watch, mpsc::Sender<()>) {
     // It is there while the job begins, so that the coordinator leaves the views to it.
     let idle = bench.worker("idle").await;
-    let job = bench.submit(tracked_request(bench)).await.unwrap().job_id;
+    let job = bench.submit(request).await.unwrap().job_id;
     let mut watch = bench.watch(&job, 0).await;
     // The key frame is given out once the static model is there and the views are ready.
     watch.until(|event| matches!(event, Event::FrameState(f) if f.frame == 1)).await;

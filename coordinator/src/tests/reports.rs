@@ -1,14 +1,19 @@
 //! Reports that meet each other, brought about at the desk itself.
 #![allow(clippy::unwrap_used, reason = "tests")]
 
+use std::time::Instant;
+
 use tokio::sync::mpsc;
 use tonic::Status;
 use trackersplat_proto::v1::{
-    CoordinatorMessage, FailureKind, Lease, Register, Report, TaskState, coordinator_message::Message,
-    report::Outcome,
+    CoordinatorMessage, FailureKind, FieldReport, Lease, Register, Report, TaskState, TrackedField,
+    coordinator_message::Message, report::Outcome,
 };
 
-use super::harness::*;
+use super::{
+    harness::*,
+    tracks::{encoded, tracked_request},
+};
 use crate::hub::{Hub, OUTGOING_QUEUE, Registered};
 
 /// A worker's stream without a network.
@@ -84,6 +89,37 @@ fn a_report_sent_again_while_it_is_verified_is_verified_once_and_answered_when_i
         assert_eq!(frame_job(&back.lease(&hub).await).frame, 2, "the job goes on");
         let frame = hub.store.frame(&job, 1).await.unwrap().unwrap();
         assert_eq!(frame.state().unwrap(), crate::queue::task::TaskState::Done);
+    });
+}
+
+#[test]
+fn a_lease_does_not_expire_while_a_field_of_it_is_verified() {
+    one_blocking_thread(async {
+        let bench = Bench::start().await;
+        let hub = bench.hub();
+        let mut stream = Stream::open(&hub, "").await;
+        let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+        let lease = stream.lease(&hub).await;
+        assert_eq!(track_job(&lease).view, "cam00");
+        let field = TrackedField { frame: 2, tracks: Some(bench.put(encoded(8, 2.0)).await) };
+        let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
+        let report = FieldReport { lease_id, attempt, field: Some(field.clone()) };
+
+        let (release, released) = std::sync::mpsc::channel::<()>();
+        let held_up = tokio::task::spawn_blocking(move || released.recv());
+        let reported = hub.field_reported(stream.registered.session, report);
+        let meanwhile = async {
+            hub.tick(Instant::now() + 10 * bench.options.lease_duration).await.unwrap();
+            release.send(()).unwrap();
+        };
+        let (reported, ()) = tokio::join!(reported, meanwhile);
+        reported.unwrap();
+        held_up.await.unwrap().unwrap();
+        let kept = hub.tracks(&job.as_str().into(), |ledger| ledger.tracks(0, 2)).await.unwrap();
+        assert_eq!(kept, field.tracks);
+        // Heartbeats that came meanwhile are still to be read.
+        hub.tick(Instant::now() + bench.options.lease_duration / 2).await.unwrap();
+        assert!(stream.messages.try_recv().is_err(), "the lease is not taken away");
     });
 }
 

@@ -25,7 +25,7 @@ pub(super) fn shifted(width: u32, x: f32) -> TrackField {
     }
 }
 
-fn encoded(width: u32, x: f32) -> Vec<u8> {
+pub(super) fn encoded(width: u32, x: f32) -> Vec<u8> {
     track_blob::encode(&shifted(width, x))
 }
 
@@ -136,6 +136,41 @@ async fn tracks_of_a_lost_worker_go_on_with_the_fields_that_it_had_stored() {
     let stale = Tracked { fields: vec![field(&bench, 3).await], state: None };
     assert!(!heir.report(&again, Outcome::Tracked(stale.clone())).await.accepted);
     assert_eq!(bench.ended_tracking(&job, &mut heir).await, ["cam00", "cam01", "cam02"]);
+}
+
+#[tokio::test]
+async fn tracks_under_the_lease_of_a_frame_fail_it_and_count_for_no_view() {
+    let bench = Bench::start().await;
+    let [mut a, mut b, mut c, mut refiner] = workers(&bench).await;
+    let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
+    for worker in [&mut a, &mut b, &mut c] {
+        worker.lease().await;
+    }
+    let lease = refiner.lease().await;
+    // There is a view at the position of this number.
+    assert_eq!(frame_job(&lease).frame, 1);
+    say(&refiner, &lease, field(&bench, 2).await).await;
+    let reason = cancelled(&mut refiner).await.reason;
+    assert!(reason.contains("under the lease of a frame"), "{reason}");
+    let failure = bench.watch(&job, 0).await.frame(1, TaskState::Ready).await.unwrap();
+    assert_eq!(failure.kind(), FailureKind::Bug);
+    let known = bench.hub().tracks(&job.as_str().into(), |ledger| ledger.tracks(1, 2)).await.unwrap();
+    assert_eq!(known, None);
+    assert_eq!(refiner.work_once(&bench).await, 1);
+}
+
+#[tokio::test]
+async fn a_field_that_claims_another_size_is_not_even_decompressed() {
+    let bench = Bench::start().await;
+    let [mut worker] = workers(&bench).await;
+    bench.submit(tracked_request(&bench)).await.unwrap();
+    let lease = worker.lease().await;
+    let content = [[8192_u32, 8192].map(u32::to_le_bytes).concat(), vec![0; 20]].concat();
+    let claiming = [&b"TSTRACK\x01"[..], blake3::hash(&content).as_bytes(), &content].concat();
+    let field = TrackedField { frame: 2, tracks: Some(bench.put(claiming).await) };
+    say(&worker, &lease, field).await;
+    let reason = cancelled(&mut worker).await.reason;
+    assert!(reason.contains("8192 x 8192 pixels, the view of 8 x 6"), "{reason}");
 }
 
 #[tokio::test]

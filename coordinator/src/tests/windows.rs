@@ -1,7 +1,7 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 //! Views that are tracked window by window, by workers and by the coordinator.
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use splat::{
     formats::{track_blob, track_state},
@@ -9,53 +9,60 @@ use splat::{
     tracking::{TrackState, Tracker, TrackingSettings},
 };
 use trackersplat_proto::v1::{
-    Blob, FailureKind, FieldReport, JobState, Lease, SubmitRequest, Tracked, TrackedField, job_event::Event,
-    lease, report::Outcome, worker_message,
+    Blob, CancelRequest, FieldReport, JobState, Lease, SubmitRequest, Tracked, TrackedField,
+    coordinator_message, job_event::Event, lease, report::Outcome, worker_message,
 };
 
 use super::{harness::*, tracks::shifted};
-use crate::{
-    failure::StageError,
-    queue::{Task, TaskKey},
-};
+use crate::{ServeOptions, failure::StageError};
 
 /// A clip of seven frames, in windows of two: the third window has two frames as well.
-async fn bench() -> Bench {
-    let bench = Bench::start().await;
+pub(super) async fn bench() -> Bench {
+    bench_with(|_| {}).await
+}
+
+pub(super) async fn bench_with(adjust: impl FnOnce(&mut ServeOptions)) -> Bench {
+    let bench = Bench::start_with(adjust).await;
     write_clip_of(7, &bench.folder.path().join("clip"), 0);
     bench
 }
 
-fn request(bench: &Bench, window: u32) -> SubmitRequest {
+pub(super) fn request(bench: &Bench, window: u32) -> SubmitRequest {
     SubmitRequest { settings_json: format!(r#"{{"tracking": {{"window": {window}}}}}"#), ..bench.request() }
 }
 
-/// A state that remembers one frame, another one for every view.
-fn state_of(view: &str, place: usize) -> Vec<u8> {
-    let motion = view.bytes().map(f32::from).sum::<f32>() * 0.01;
+/// The state of an honest tracker after the frame at a place, another one for every view.
+pub(super) fn state_of(view: &str, place: usize) -> Vec<u8> {
+    state_of_size((8, 6), view, 1..place + 1)
+}
+
+/// The state after tracking frames from the key frame on.
+pub(super) fn state_of_size((width, height): (u32, u32), view: &str, frames: Range<usize>) -> Vec<u8> {
+    let motion = 0.2 * (view.bytes().map(u32::from).sum::<u32>() % 7) as f32;
     let image = |place: usize| {
-        let mut image = Image::filled(24, 16, [0.0; 3]);
+        let mut image = Image::filled(width, height, [0.0; 3]);
         for (index, pixel) in image.pixels.chunks_exact_mut(3).enumerate() {
-            let (x, y) = ((index % 24) as f32 - motion * place as f32, (index / 24) as f32);
-            pixel.fill(0.5 + 0.25 * (x * 0.9).sin() + 0.25 * (y * 0.7).cos());
+            let (x, y) = (index % width as usize, index / width as usize);
+            let x = x as f32 - motion * place as f32;
+            pixel.fill(0.5 + 0.25 * (x * 0.9).sin() + 0.25 * (y as f32 * 0.7).cos());
         }
         Arc::new(image)
     };
     let mut load = |place| Ok::<_, StageError>(image(place));
     let settings = TrackingSettings::default();
-    let (nothing, window) = (TrackState::default(), place..place + 1);
+    let nothing = TrackState::default();
     let tracked =
-        Tracker::BuiltIn.track_window(nothing, window, &|_| true, &mut load, &settings, &mut |_, _| Ok(()));
+        Tracker::BuiltIn.track_window(nothing, frames, &|_| true, &mut load, &settings, &mut |_, _| Ok(()));
     track_state::encode(&tracked.ok().unwrap())
 }
 
-async fn field(bench: &Bench, frame: u32) -> TrackedField {
+pub(super) async fn field(bench: &Bench, frame: u32) -> TrackedField {
     let encoded = track_blob::encode(&shifted(8, frame as f32));
     TrackedField { frame, tracks: Some(bench.put(encoded).await) }
 }
 
 /// What an honest worker reports of a window.
-async fn window(bench: &Bench, lease: &Lease) -> Tracked {
+pub(super) async fn window(bench: &Bench, lease: &Lease) -> Tracked {
     let job = track_job(lease);
     let mut fields = Vec::new();
     for frame in job.frames[1..].iter().filter(|frame| frame.tracks.is_none()) {
@@ -69,14 +76,14 @@ async fn window(bench: &Bench, lease: &Lease) -> Tracked {
 }
 
 /// Name of the view, numbers of the window's frames.
-fn leased(lease: &Lease) -> (String, Vec<u32>) {
+pub(super) fn leased(lease: &Lease) -> (String, Vec<u32>) {
     let job = track_job(lease);
     (job.view, job.frames[1..].iter().map(|frame| frame.frame).collect())
 }
 
 impl Worker {
     /// Does a task honestly.
-    async fn finish(&mut self, bench: &Bench, lease: &Lease) {
+    pub(super) async fn finish(&mut self, bench: &Bench, lease: &Lease) {
         let outcome = match &lease.task {
             Some(lease::Task::Tracks(_)) => Outcome::Tracked(window(bench, lease).await),
             _ => Outcome::Success(bench.result(lease).await),
@@ -86,7 +93,7 @@ impl Worker {
     }
 
     /// The next window, once the frames before it are done.
-    async fn window(&mut self, bench: &Bench) -> Lease {
+    pub(super) async fn window(&mut self, bench: &Bench) -> Lease {
         loop {
             let lease = self.lease().await;
             if let Some(lease::Task::Tracks(_)) = lease.task {
@@ -97,7 +104,7 @@ impl Worker {
     }
 
     /// Does everything until the job ends; the windows that it was given.
-    async fn finish_job(&mut self, bench: &Bench, job: &str) -> Vec<(String, Vec<u32>)> {
+    pub(super) async fn finish_job(&mut self, bench: &Bench, job: &str) -> Vec<(String, Vec<u32>)> {
         let mut windows = Vec::new();
         loop {
             tokio::select! {
@@ -117,7 +124,7 @@ impl Worker {
 }
 
 /// A worker, and a job of which it has done the first windows of all views.
-async fn after_first_windows(bench: &Bench) -> (Worker, String) {
+pub(super) async fn after_first_windows(bench: &Bench) -> (Worker, String) {
     let mut worker = bench.worker("w").await;
     let job = bench.submit(request(bench, 2)).await.unwrap().job_id;
     for view in ["cam00", "cam01", "cam02"] {
@@ -166,12 +173,12 @@ async fn views_take_turns_and_frames_are_done_while_later_windows_wait() {
     }
 }
 
-fn state_file(bench: &Bench, view: &str, place: usize) -> std::path::PathBuf {
+pub(super) fn state_file(bench: &Bench, view: &str, place: usize) -> std::path::PathBuf {
     let digest = crate::blobs::name(&state_of(view, place)).digest;
     bench.options.root.join("blobs").join(&digest[..2]).join(&digest)
 }
 
-fn remove_state(bench: &Bench, view: &str, place: usize) {
+pub(super) fn remove_state(bench: &Bench, view: &str, place: usize) {
     std::fs::remove_file(state_file(bench, view, place)).unwrap();
 }
 
@@ -260,7 +267,8 @@ async fn who_is_lost_between_the_last_field_and_the_report_leaves_the_coordinato
 
 #[tokio::test]
 async fn a_restarted_coordinator_goes_on_at_the_end_of_the_last_window() {
-    let mut bench = bench().await;
+    // However long the worker takes to come back, the coordinator tracks nothing by itself.
+    let mut bench = bench_with(|options| options.reconnect_grace = options.lease_duration).await;
     let (_, job) = after_first_windows(&bench).await;
     bench.stop().await;
     bench.restart().await;
@@ -271,178 +279,75 @@ async fn a_restarted_coordinator_goes_on_at_the_end_of_the_last_window() {
 }
 
 #[tokio::test]
-async fn a_state_that_is_gone_or_damaged_costs_the_window_before_it_and_no_attempt() {
+async fn a_job_that_is_cancelled_between_two_windows_goes_on_at_the_end_of_the_last_one() {
     let bench = bench().await;
     let (mut worker, job) = after_first_windows(&bench).await;
-    let file = |view: &str| state_file(&bench, view, 2);
-    std::fs::remove_file(file("cam00")).unwrap();
-    let lease = worker.window(&bench).await;
-    let request = track_job(&lease);
-    assert_eq!((leased(&lease), request.first), (("cam00".into(), vec![2, 3]), 1));
-    assert!(request.wants_state && request.frames[1..].iter().all(|frame| frame.tracks.is_some()));
-    worker.finish(&bench, &lease).await;
-    let lease = worker.window(&bench).await;
-    assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
-    worker.finish(&bench, &lease).await;
-
-    let size = std::fs::metadata(file("cam01")).unwrap().len();
-    std::fs::write(file("cam01"), vec![7; size as usize]).unwrap();
-    let lease = worker.window(&bench).await;
-    assert_eq!(leased(&lease), ("cam01".into(), vec![4, 5]));
-    assert!(worker.fail(&lease, FailureKind::Transient).await.accepted);
-    let lease = worker.window(&bench).await;
-    assert_eq!((leased(&lease), lease.attempt), (("cam01".into(), vec![2, 3]), 3));
-    let key = TaskKey { job: job.as_str().into(), task: Task::Tracks(1) };
-    assert_eq!(bench.hub().store.task(&key).await.unwrap().unwrap().failures, 0);
-    worker.finish(&bench, &lease).await;
-    let rest = worker.finish_job(&bench, &job).await;
-    assert_eq!(rest.len(), 5, "{rest:?}");
-}
-
-#[tokio::test]
-async fn a_state_that_is_gone_in_the_third_window_costs_the_second_only() {
-    let bench = bench().await;
-    let (mut worker, job) = after_first_windows(&bench).await;
-    for _ in 0..3 {
-        let lease = worker.window(&bench).await;
-        worker.finish(&bench, &lease).await;
-    }
-    remove_state(&bench, "cam00", 4);
-    let lease = worker.window(&bench).await;
-    let request = track_job(&lease);
-    assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
-    assert_eq!(request.state, Some(crate::blobs::name(&state_of("cam00", 2))));
-    worker.finish(&bench, &lease).await;
-    let rest = worker.finish_job(&bench, &job).await;
-    assert_eq!(rest.len(), 3, "{rest:?}");
-}
-
-#[tokio::test]
-async fn jobs_of_one_clip_keep_their_states_apart() {
-    let bench = bench().await;
-    let first = bench.submit(request(&bench, 2)).await.unwrap().job_id;
-    let mut held = Vec::new();
-    for (name, view) in [("a", "cam00"), ("b", "cam01"), ("c", "cam02")] {
-        let mut worker = bench.worker(name).await;
-        let lease = worker.window(&bench).await;
-        assert_eq!(leased(&lease).0, view);
-        held.push((worker, lease));
-    }
-    let again = SubmitRequest { output: bench.path("again"), ..request(&bench, 2) };
-    let second = bench.submit(again).await.unwrap().job_id;
-    let mut other = bench.worker("d").await;
-    let lease = other.window(&bench).await;
-    assert_eq!((track_job(&lease).job_id, leased(&lease).0), (second.clone(), "cam00".into()));
-    other.finish(&bench, &lease).await;
-
-    let (worker, lease) = &mut held[0];
-    worker.finish(&bench, lease).await;
-    for frames in [[4, 5], [6, 7]] {
-        let lease = worker.window(&bench).await;
-        assert_eq!(
-            (track_job(&lease).job_id, leased(&lease)),
-            (first.clone(), ("cam00".into(), frames.into()))
-        );
-        worker.finish(&bench, &lease).await;
-    }
-    let of_second = |ledger: &crate::ledger::TrackLedger| ledger.next_state(0);
-    let state = bench.hub().tracks(&second.as_str().into(), of_second).await.unwrap().unwrap();
-    let blob = state.blob.unwrap();
-    assert_eq!(blob, crate::blobs::name(&state_of("cam00", 2)));
-    assert!(bench.hub().blobs.holds(&blob).await, "the first job has discarded its own only");
-    assert!(bench.hub().store.artifact(&state.key).await.unwrap().is_some());
-}
-
-#[tokio::test]
-async fn a_state_that_cannot_be_gone_on_from_is_made_again_and_the_failure_counts() {
-    let bench = bench().await;
-    let (mut worker, job) = after_first_windows(&bench).await;
-    let key = TaskKey { job: job.as_str().into(), task: Task::Tracks(0) };
-    for failures in 1..=3 {
-        let lease = worker.window(&bench).await;
-        assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
-        assert!(worker.fail(&lease, FailureKind::Bug).await.accepted);
-        let record = bench.hub().store.task(&key).await.unwrap().unwrap();
-        assert_eq!(record.failures, failures, "a state that is made again is no progress");
-        if failures < 3 {
-            let lease = worker.window(&bench).await;
-            assert_eq!((leased(&lease), track_job(&lease).state), (("cam00".into(), vec![2, 3]), None));
-            worker.finish(&bench, &lease).await;
-        }
-    }
-    let (state, failure) = bench.ended(&job).await;
-    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Bug));
-    assert!(!state_file(&bench, "cam00", 2).exists(), "a resubmission begins before it");
-}
-
-#[tokio::test]
-async fn a_store_that_keeps_no_state_fails_the_job() {
-    let bench = bench().await;
-    let (mut worker, job) = after_first_windows(&bench).await;
-    let mut refused = Vec::new();
-    for _ in 0..5 {
-        remove_state(&bench, "cam00", 2);
-        let lease = worker.window(&bench).await;
-        assert_eq!(leased(&lease), ("cam00".into(), vec![2, 3]));
-        let tracked = window(&bench, &lease).await;
-        let receipt = worker.report(&lease, Outcome::Tracked(tracked)).await;
-        refused.push((!receipt.accepted).then_some(receipt.reason));
-    }
-    assert!(refused[..2].iter().all(Option::is_none), "{refused:?}");
-    assert!(refused[2..].iter().flatten().all(|reason| reason.contains("check its disk")), "{refused:?}");
-    let (state, failure) = bench.ended(&job).await;
-    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Transient));
-}
-
-#[tokio::test]
-async fn states_that_a_killed_coordinator_left_behind_are_removed() {
-    let mut bench = bench().await;
-    let (mut worker, job) = after_first_windows(&bench).await;
-    let id: crate::queue::JobId = job.as_str().into();
-    let first = bench.hub().tracks(&id, |ledger| ledger.next_state(0)).await.unwrap().unwrap();
-    let windows = worker.finish_job(&bench, &job).await;
-    assert_eq!(windows.len(), 6);
-    bench.stop().await;
-    // As it is left between the report that completes a view and the removal of its states.
-    let blob = first.blob.unwrap();
-    let store = crate::store::Store::open(&bench.options.root.join("state.sqlite")).await.unwrap();
-    let mut change = store.change().await.unwrap();
-    let artifact = crate::store::Artifact { blob: blob.clone(), note: String::new() };
-    change.put_artifact(&first.key, "track-state", &artifact).await.unwrap();
-    change.commit().await.unwrap();
-    store.close().await;
-    let file = state_file(&bench, "cam00", 2);
-    std::fs::write(&file, state_of("cam00", 2)).unwrap();
-    std::fs::remove_dir_all(bench.path("out")).unwrap();
-    bench.restart().await;
+    within(bench.jobs().cancel(CancelRequest { job_id: job.clone() })).await.unwrap();
+    assert_eq!(bench.ended(&job).await.0, JobState::Cancelled);
     assert!(bench.submit(request(&bench, 2)).await.unwrap().resumed);
-    let mut worker = bench.worker("w").await;
-    assert!(worker.finish_job(&bench, &job).await.is_empty());
-    assert!(!file.exists() && bench.hub().store.artifact(&first.key).await.unwrap().is_none());
+    let windows = worker.finish_job(&bench, &job).await;
+    let numbers: Vec<&[u32]> = windows.iter().map(|window| window.1.as_slice()).collect();
+    assert_eq!(numbers, [[4, 5], [4, 5], [4, 5], [6, 7], [6, 7], [6, 7]]);
 }
 
 #[tokio::test]
-async fn a_window_needs_its_state_and_one_of_its_own_frames() {
+async fn a_window_that_is_reported_again_is_accepted_and_changes_nothing() {
+    let bench = bench().await;
+    let (mut first, mut second) = (bench.worker("first").await, bench.worker("second").await);
+    let job = bench.submit(request(&bench, 2)).await.unwrap().job_id;
+    let lease = first.window(&bench).await;
+    let outcome = Outcome::Tracked(window(&bench, &lease).await);
+    assert!(first.report(&lease, outcome.clone()).await.accepted);
+    // The receipt was lost.
+    let mut next = second.window(&bench).await;
+    while leased(&next).0 != "cam00" {
+        second.finish(&bench, &next).await;
+        next = second.window(&bench).await;
+    }
+    assert_eq!((leased(&next), next.attempt), (("cam00".into(), vec![4, 5]), 2));
+    assert!(first.report(&lease, outcome).await.accepted);
+    second.finish(&bench, &next).await;
+    let rest = first.finish_job(&bench, &job).await;
+    assert!(!rest.contains(&("cam00".into(), vec![2, 3])) && !rest.contains(&leased(&next)), "{rest:?}");
+}
+
+#[tokio::test]
+async fn a_field_of_another_window_fails_the_attempt() {
     let bench = bench().await;
     let mut worker = bench.worker("w").await;
     let job = bench.submit(request(&bench, 2)).await.unwrap().job_id;
-    let states = [
-        (None, "lacks the tracker's state"),
-        (Some(bench.put(b"no state".to_vec()).await), "not a TSSTATE blob"),
-    ];
-    for (state, said) in states {
-        let lease = worker.window(&bench).await;
-        let tracked = Tracked { state, ..window(&bench, &lease).await };
-        let receipt = worker.report(&lease, Outcome::Tracked(tracked)).await;
-        assert!(!receipt.accepted && receipt.reason.contains(said), "{receipt:?}");
-    }
     let lease = worker.window(&bench).await;
-    let state = Some(bench.put(state_of("cam00", 3)).await);
-    let receipt = worker.report(&lease, Outcome::Tracked(Tracked { fields: vec![], state })).await;
-    assert!(!receipt.accepted, "{receipt:?}");
-    assert!(receipt.reason.contains("remembers the view's frame 3, frames 1 to 2"), "{}", receipt.reason);
-    let (state, failure) = bench.ended(&job).await;
-    assert_eq!((state, failure.unwrap().kind()), (JobState::Failed, FailureKind::Bug));
+    assert_eq!(leased(&lease), ("cam00".into(), vec![2, 3]));
+    let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
+    let report = FieldReport { lease_id, attempt, field: Some(field(&bench, 4).await) };
+    worker.send(worker_message::Message::Field(report)).await;
+    let cancelled = worker.receive().await.unwrap();
+    let coordinator_message::Message::CancelLease(cancel) = cancelled else { panic!("{cancelled:?}") };
+    assert!(cancel.reason.contains("frame 4: not of the window"), "{}", cancel.reason);
+    let lease = worker.window(&bench).await;
+    assert_eq!((leased(&lease), lease.attempt), (("cam00".into(), vec![2, 3]), 2));
+    let mut tracked = window(&bench, &lease).await;
+    tracked.fields.push(field(&bench, 5).await);
+    let receipt = worker.report(&lease, Outcome::Tracked(tracked)).await;
+    assert!(!receipt.accepted && receipt.reason.contains("frame 5: not of the window"), "{receipt:?}");
+    let later = |ledger: &crate::ledger::TrackLedger| (ledger.tracks(0, 4), ledger.tracks(0, 5));
+    assert_eq!(bench.hub().tracks(&job.as_str().into(), later).await.unwrap(), (None, None));
+}
+
+#[tokio::test]
+async fn of_two_jobs_of_one_clip_one_tracks_and_the_other_takes_over() {
+    let bench = bench().await;
+    let (mut worker, first) = after_first_windows(&bench).await;
+    let again = SubmitRequest { output: bench.path("again"), ..request(&bench, 2) };
+    let second = bench.submit(again).await.unwrap().job_id;
+    let ready = |event: &Event| matches!(event, Event::TracksState(t) if t.view == "cam02");
+    bench.watch(&second, 0).await.until(ready).await;
+    let windows = worker.finish_job(&bench, &second).await;
+    assert_eq!(bench.ended(&first).await.0, JobState::Done);
+    let (empty, tracked): (Vec<_>, Vec<_>) = windows.into_iter().partition(|window| window.1.is_empty());
+    let views: Vec<&str> = empty.iter().map(|window| window.0.as_str()).collect();
+    assert_eq!(views, ["cam00", "cam01", "cam02"], "of the second job only the reports are left");
+    assert_eq!(tracked.len(), 6, "{tracked:?}");
 }
 
 #[tokio::test]

@@ -64,13 +64,23 @@ pub fn encode(field: &TrackField) -> Vec<u8> {
     seal(MAGIC, VERSION, &header, &body)
 }
 
+/// The width and height that a blob claims, checked against nothing: so that one that nobody wants need not be
+/// decompressed.
+pub fn size(bytes: &[u8]) -> Result<(u32, u32), TrackError> {
+    Ok(size_of(&Sealed::open(MAGIC, VERSION, HEADER, bytes)?))
+}
+
+fn size_of(sealed: &Sealed<'_>) -> (u32, u32) {
+    let (width, height) = sealed.header.split_at(4);
+    // The header has exactly these lengths, so the defaults are never taken.
+    let number = |bytes: &[u8]| u32::from_le_bytes(bytes.try_into().unwrap_or_default());
+    (number(width), number(height))
+}
+
 /// Decompresses a track field.
 pub fn decode(bytes: &[u8]) -> Result<TrackField, TrackError> {
     let sealed = Sealed::open(MAGIC, VERSION, HEADER, bytes)?;
-    let (width, height) = sealed.header.split_at(4);
-    // The header has exactly these lengths, so the defaults are never taken.
-    let width = u32::from_le_bytes(width.try_into().unwrap_or_default());
-    let height = u32::from_le_bytes(height.try_into().unwrap_or_default());
+    let (width, height) = size_of(&sealed);
     if width.max(height) > MAX_SIDE || u64::from(width) * u64::from(height) > MAX_PIXELS {
         return Err(TrackError::Size { width, height });
     }
@@ -212,6 +222,8 @@ mod tests {
         }
         let header = |width: u32, height: u32| [width.to_le_bytes(), height.to_le_bytes()].concat();
         let huge = seal(MAGIC, VERSION, &header(u32::MAX, u32::MAX), &[]);
+        assert_eq!(size(&huge).unwrap(), (u32::MAX, u32::MAX), "known without the body");
+        assert!(size(&huge[..huge.len() - 1]).is_err());
         assert!(matches!(decode(&huge), Err(TrackError::Size { .. })));
         for body in [0, 11, 13] {
             let short = seal(MAGIC, VERSION, &header(1, 1), &vec![0; body]);

@@ -44,10 +44,31 @@ pub fn encode(state: &TrackState) -> Vec<u8> {
     seal(MAGIC, VERSION, &header, &body)
 }
 
+/// What a state says of itself before it is decompressed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// Columns of the tracks.
+    pub width: u32,
+    /// Rows of the tracks.
+    pub height: u32,
+    /// Frames that are remembered.
+    pub frames: u32,
+}
+
+/// The shape that a blob claims, checked against nothing: so that one that nobody wants need not be decompressed.
+pub fn shape(bytes: &[u8]) -> Result<Shape, TrackError> {
+    Ok(shape_of(&Sealed::open(MAGIC, VERSION, HEADER, bytes)?))
+}
+
+fn shape_of(sealed: &Sealed<'_>) -> Shape {
+    let [width, height, frames] = [0, 4, 8].map(|start| number(&sealed.header[start..]));
+    Shape { width, height, frames }
+}
+
 /// Decompresses a state.
 pub fn decode(bytes: &[u8]) -> Result<TrackState, TrackError> {
     let sealed = Sealed::open(MAGIC, VERSION, HEADER, bytes)?;
-    let [width, height, frames] = [0, 4, 8].map(|start| number(&sealed.header[start..]));
+    let Shape { width, height, frames } = shape_of(&sealed);
     let pixels = u64::from(width) * u64::from(height);
     let size = uncompressed_bytes(width, height, frames);
     if width.max(height) > MAX_SIDE || pixels > MAX_PIXELS {
@@ -139,6 +160,16 @@ mod tests {
             );
         }
         assert_eq!(decode(&encode(&TrackState::default())).unwrap(), TrackState::default());
+    }
+
+    #[test]
+    fn the_shape_is_read_without_the_body() {
+        let shape_of = |bytes: &[u8]| shape(bytes).map(|shape| (shape.width, shape.height, shape.frames));
+        assert_eq!(shape_of(&encode(&state(&[4, 5]))).unwrap(), (9, 4, 2));
+        assert_eq!(shape_of(&encode(&TrackState::default())).unwrap(), (0, 0, 0));
+        let claimed = seal(MAGIC, VERSION, &header(8192, 8191, u32::MAX), &[]);
+        assert_eq!(shape_of(&claimed).unwrap(), (8192, 8191, u32::MAX));
+        assert!(shape_of(&claimed[..claimed.len() - 1]).is_err());
     }
 
     #[test]

@@ -84,7 +84,7 @@ pub(super) enum Levels {
 impl Pyramid {
     /// The pyramid of an image that has pixels.
     pub(super) fn new(image: &Image, settings: &TrackingSettings) -> Self {
-        let halvings = halvings(image, settings);
+        let halvings = settings.halvings(image.width, image.height);
         let levels = if settings.colour {
             Levels::Colour(Level::pyramid(Planes::from_image(image, halvings), settings))
         } else {
@@ -106,12 +106,20 @@ impl Pyramid {
     }
 }
 
-/// How often an image is halved before it is matched.
-fn halvings(image: &Image, settings: &TrackingSettings) -> u32 {
-    let longer = image.width.max(image.height);
-    let at_least = if longer > settings.quarter_side { 2 } else { u32::from(longer > settings.full_side) };
-    let fits = |&halvings: &u32| longer.div_ceil(1 << halvings) <= settings.max_side.max(2);
-    (at_least..31).find(fits).unwrap_or(31)
+impl TrackingSettings {
+    /// Columns and rows at which the built-in tracker matches images of this size: the size of its states.
+    pub fn matched_size(&self, width: u32, height: u32) -> (u32, u32) {
+        let side = 1 << self.halvings(width, height);
+        (width.div_ceil(side), height.div_ceil(side))
+    }
+
+    /// How often images of this size are halved before they are matched.
+    fn halvings(&self, width: u32, height: u32) -> u32 {
+        let longer = width.max(height);
+        let at_least = if longer > self.quarter_side { 2 } else { u32::from(longer > self.full_side) };
+        let fits = |&halvings: &u32| longer.div_ceil(1 << halvings) <= self.max_side.max(2);
+        (at_least..31).find(fits).unwrap_or(31)
+    }
 }
 
 /// A frame, prepared for comparison and, by `P`, for its matcher.
@@ -127,7 +135,7 @@ pub(super) struct Frame<P> {
 impl Frame<()> {
     /// A frame for a matcher that takes its colours.
     pub(super) fn plain(image: &Image, settings: &TrackingSettings) -> Self {
-        let colours = Arc::new(Planes::from_image(image, halvings(image, settings)));
+        let colours = Arc::new(Planes::from_image(image, settings.halvings(image.width, image.height)));
         Self { texture: texture(&colours), colours, prepared: () }
     }
 }
@@ -149,7 +157,9 @@ impl Frame<Pyramid> {
         let pyramid = Pyramid::new(image, settings);
         let colours = match &pyramid.levels {
             Levels::Colour(levels) => Arc::clone(&levels[0].planes),
-            Levels::Luma(_) => Arc::new(Planes::from_image(image, halvings(image, settings))),
+            Levels::Luma(_) => {
+                Arc::new(Planes::from_image(image, settings.halvings(image.width, image.height)))
+            }
         };
         Self { texture: texture(&colours), colours, prepared: pyramid }
     }

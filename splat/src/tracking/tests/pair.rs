@@ -5,7 +5,7 @@ use crate::{
     simd::{Instructions, LANES, Plain, Simd as _},
     tracking::{
         flow::Flow,
-        pair::{Level, Pyramid, match_pyramids},
+        pair::{Frame, Level, Pyramid, match_pyramids},
         patches::{self, Guess, PatchField},
         planes::{PATCH, Planes},
         refine::{Smoothing, refine},
@@ -46,6 +46,23 @@ fn end_point_errors(flow: &DenseFlow, truth: impl Fn([f32; 2]) -> [f32; 2]) -> V
         (found[0] - exact[0]).hypot(found[1] - exact[1])
     };
     flow.displacement.iter().enumerate().map(error).collect()
+}
+
+#[test]
+fn frames_are_matched_at_the_size_that_the_settings_say() {
+    for quality in QUALITIES {
+        let settings = TrackingSettings::preset(quality);
+        for (width, height) in [(1, 1), (8, 6), (400, 3), (401, 3), (5, 799), (801, 2), (3, 1601), (3203, 1)]
+        {
+            let frame = Frame::new(&Image::filled(width, height, [0.5; 3]), &settings);
+            let found = (frame.width() as u32, frame.height() as u32);
+            assert_eq!(settings.matched_size(width, height), found, "{quality:?} {width}x{height}");
+        }
+    }
+    let draft = TrackingSettings::preset(Quality::Draft);
+    for (side, matched) in [(160, 160), (320, 160), (640, 160), (1280, 320), (1920, 480), (3840, 480)] {
+        assert_eq!(draft.matched_size(side, 9).0, matched, "{side}");
+    }
 }
 
 #[test]
