@@ -228,3 +228,11 @@ impl Desk {
         Some(state)
     }
 }
+
+#[cfg(test)]
+impl Hub {
+    /// The turn of whoever reads a state.
+    pub(crate) async fn turn_to_read_a_state(&self) -> tokio::sync::MutexGuard<'_, ()> {
+        self.reading_state.lock().await
+    }
+}

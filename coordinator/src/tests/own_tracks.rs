@@ -121,6 +121,28 @@ async fn an_image_that_cannot_be_read_fails_the_job_and_names_view_and_frame() {
 }
 
 #[tokio::test]
+async fn a_store_that_fails_for_a_moment_fails_no_attempt() {
+    let bench = Bench::start().await;
+    let (_, mut watch, busy) = tracking_alone(&bench).await;
+    let (inside, aside) = (bench.options.root.join("blobs"), bench.folder.path().join("aside"));
+    std::fs::rename(&inside, &aside).unwrap();
+    // A folder that is a file is no answer, as an input or output error is none.
+    std::fs::write(&inside, b"").unwrap();
+    drop(busy);
+    // Three attempts that fail at once are over by then, and the coordinator's patience is not.
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    std::fs::remove_file(&inside).unwrap();
+    std::fs::rename(&aside, &inside).unwrap();
+    let tracked = |event: &Event| {
+        if let Event::TracksState(t) = event {
+            assert!(t.attempt <= 1 && t.failure.is_none(), "{t:?}");
+        }
+        matches!(event, Event::JobState(j) if j.state() == JobState::Frames)
+    };
+    watch.until(tracked).await;
+}
+
+#[tokio::test]
 async fn frames_that_were_tracked_before_a_restart_are_given_out_after_it() {
     let mut bench = Bench::start().await;
     let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;

@@ -1,20 +1,37 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 //! The tracker's states between windows: lost, refused, discarded, and not mistaken for each other.
 
+use std::time::Duration;
+
 use splat::{formats::track_state, tracking::TrackState};
 use trackersplat_proto::v1::{
-    Failure, FailureKind, JobState, Report, SubmitRequest, Tracked, coordinator_message, report::Outcome,
-    worker_message,
+    Failure, FailureKind, JobState, Lease, Report, ReportReceipt, SubmitRequest, Tracked,
+    coordinator_message, report::Outcome, worker_message,
 };
 
 use super::{harness::*, windows::*};
 use crate::queue::{Task, TaskKey};
 
+/// What a worker says that gives a window up.
+fn failed(lease: &Lease) -> worker_message::Message {
+    let failure = Failure { kind: FailureKind::Transient.into(), message: "as the test wants it".into() };
+    let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
+    let report = Report { lease_id, attempt, outcome: Some(Outcome::Failure(failure)) };
+    worker_message::Message::Report(report)
+}
+
+async fn receipt(worker: &mut Worker) -> ReportReceipt {
+    match worker.receive().await.unwrap() {
+        coordinator_message::Message::Receipt(receipt) => receipt,
+        other => panic!("{other:?}"),
+    }
+}
+
 /// Waits until a file is removed.
 async fn until_removed(file: &std::path::Path) {
     let removed = async {
         while file.exists() {
-            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+            tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
     within(removed).await;
@@ -304,6 +321,22 @@ async fn a_discarded_state_is_removed_before_its_row() {
 }
 
 #[tokio::test]
+async fn the_state_of_a_window_that_failed_is_read_in_turn() {
+    let bench = bench().await;
+    let (mut worker, _) = after_first_windows(&bench).await;
+    let lease = worker.window(&bench).await;
+    assert_eq!(leased(&lease), ("cam00".into(), vec![4, 5]));
+    let hub = bench.hub();
+    let turn = hub.turn_to_read_a_state().await;
+    worker.send(failed(&lease)).await;
+    // Who reads out of turn has ended by then.
+    let early = tokio::time::timeout(Duration::from_millis(300), worker.receive()).await;
+    assert!(early.is_err(), "{early:?}");
+    drop(turn);
+    assert!(receipt(&mut worker).await.accepted);
+}
+
+#[tokio::test]
 async fn a_damaged_state_is_removed_before_its_row() {
     let bench = bench().await;
     let (mut worker, _) = after_first_windows(&bench).await;
@@ -313,13 +346,8 @@ async fn a_damaged_state_is_removed_before_its_row() {
     std::fs::write(&file, vec![7; std::fs::metadata(&file).unwrap().len() as usize]).unwrap();
     // Nobody else writes to the database meanwhile.
     let change = bench.hub().store.change().await.unwrap();
-    let failure = Failure { kind: FailureKind::Transient.into(), message: "a damaged state".into() };
-    let (lease_id, attempt) = (lease.lease_id.clone(), lease.attempt);
-    let report = Report { lease_id, attempt, outcome: Some(Outcome::Failure(failure)) };
-    worker.send(worker_message::Message::Report(report)).await;
+    worker.send(failed(&lease)).await;
     until_removed(&file).await;
     drop(change);
-    let received = worker.receive().await.unwrap();
-    let coordinator_message::Message::Receipt(receipt) = received else { panic!("{received:?}") };
-    assert!(receipt.accepted, "{receipt:?}");
+    assert!(receipt(&mut worker).await.accepted);
 }

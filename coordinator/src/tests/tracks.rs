@@ -1,8 +1,6 @@
 #![allow(clippy::unwrap_used, reason = "tests")]
 //! Tracks of views as tasks: given out, reported field by field, resumed.
 
-use std::time::Duration;
-
 use splat::{formats::track_blob, tracking::TrackField};
 use trackersplat_proto::v1::{
     Blob, CancelLease, FailureKind, FieldReport, JobState, Lease, SubmitRequest, TaskState, Tracked,
@@ -106,8 +104,7 @@ async fn a_frame_is_given_out_once_every_view_is_tracked_to_it() {
 
 #[tokio::test]
 async fn tracks_of_a_lost_worker_go_on_with_the_fields_that_it_had_stored() {
-    // Long enough for the heir to come back before the coordinator tracks by itself.
-    let mut bench = Bench::start_with(|options| options.reconnect_grace = Duration::from_secs(3)).await;
+    let mut bench = Bench::start().await;
     let [lost, mut heir] = workers(&bench).await;
     let mut lost = lost;
     let job = bench.submit(tracked_request(&bench)).await.unwrap().job_id;
@@ -131,6 +128,8 @@ async fn tracks_of_a_lost_worker_go_on_with_the_fields_that_it_had_stored() {
 
     // So does a coordinator that was killed: its leases are void, the fields are on disk.
     bench.stop().await;
+    // However long the heir takes to come back, the coordinator tracks nothing by itself.
+    bench.options.reconnect_grace = bench.options.lease_duration;
     bench.restart().await;
     let mut heir = bench.worker("w1").await;
     let stale = Tracked { fields: vec![field(&bench, 3).await], state: None };
