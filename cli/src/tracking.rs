@@ -141,7 +141,7 @@ pub(crate) struct ChosenViews {
 }
 
 impl ChosenViews {
-    pub(crate) fn open(args: &ViewsArgs, interrupted: CancellationToken) -> Result<Self, CliError> {
+    pub(crate) fn open(args: &ViewsArgs) -> Result<Self, CliError> {
         let options = ClipOptions {
             frames: args.frames.map(|range| (range.first, range.last)),
             // Every image is looked at while it is the latest, which `KeepsLast` holds.
@@ -155,7 +155,12 @@ impl ChosenViews {
             let why = format!("tracks need two frames, there are {}", opened.clip.frames().len());
             return Err(CliError::bad_input(args.clip.display(), format!("{why}; --frames takes more")));
         }
-        Ok(Self { opened, interrupted, positions })
+        Ok(Self { opened, interrupted: CancellationToken::new(), positions })
+    }
+
+    /// The same, to be tracked until `interrupted` is cancelled.
+    pub(crate) fn until(self, interrupted: CancellationToken) -> Self {
+        Self { interrupted, ..self }
     }
 
     pub(crate) fn clip(&self) -> &Clip {
@@ -166,7 +171,7 @@ impl ChosenViews {
     pub(crate) fn go_on(&self) -> Result<(), CliError> {
         if self.interrupted.is_cancelled() {
             return Err(CliError::Interrupted(
-                "interrupted; nothing is kept of what was unfinished".to_owned(),
+                "interrupted; no npz is kept of what was unfinished".to_owned(),
             ));
         }
         Ok(())

@@ -78,9 +78,13 @@ impl BlobStore {
         match self.store.put_opts(&path, PutPayload::from_bytes(bytes.clone()), create).await {
             Ok(_) => Ok(blob),
             Err(object_store::Error::AlreadyExists { .. }) => {
-                if !self.holds(&blob).await {
-                    self.store.put(&path, PutPayload::from_bytes(bytes)).await?;
+                // Of the right size it may be damaged all the same.
+                match self.get(&blob).await {
+                    Ok(_) => return Ok(blob),
+                    Err(BlobError::Missing(_) | BlobError::Corrupt { .. }) => {}
+                    Err(error) => return Err(error),
                 }
+                self.store.put(&path, PutPayload::from_bytes(bytes)).await?;
                 Ok(blob)
             }
             Err(error) => Err(error.into()),
@@ -303,10 +307,13 @@ mod tests {
         std::fs::write(&file, b"other bytes!").unwrap();
         assert!(matches!(store.get(&blob).await, Err(BlobError::Corrupt { .. })));
         assert!(matches!(read_all(&store, &blob.digest).await, Err(BlobError::Corrupt { .. })));
-        std::fs::write(&file, b"cut").unwrap();
-        assert!(!store.holds(&blob).await);
-        store.put(bytes.clone()).await.unwrap();
-        assert_eq!(store.get(&blob).await.unwrap(), bytes);
+        // Cut short, and of the same size.
+        for damaged in [&b"cut"[..], b"other bytes!"] {
+            std::fs::write(&file, damaged).unwrap();
+            assert_eq!(store.holds(&blob).await, damaged.len() == bytes.len());
+            store.put(bytes.clone()).await.unwrap();
+            assert_eq!(store.get(&blob).await.unwrap(), bytes);
+        }
     }
 
     #[tokio::test]

@@ -22,8 +22,10 @@ pub(crate) fn test() -> Result<()> {
     // The end-to-end tests run the program itself. Built alone its dependencies would have other features than those of
     // the tests, and nearly everything would be compiled twice.
     run(&["build", "--workspace", "--tests", "--bin", "trackersplat"])?;
-    let program = std::env::current_exe().context("the folder of this program")?;
-    let program = program.with_file_name(format!("trackersplat{}", std::env::consts::EXE_SUFFIX));
+    // This program may have been built for release, beside the folder of the tests.
+    let this = std::env::current_exe().context("the path of this program")?;
+    let target = this.ancestors().nth(2).context("the folder of builds")?;
+    let program = target.join("debug").join(format!("trackersplat{}", std::env::consts::EXE_SUFFIX));
     let arguments = ["test", "--workspace", "--no-fail-fast"];
     announce(&arguments);
     let mut tests = cargo();

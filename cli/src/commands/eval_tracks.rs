@@ -13,9 +13,8 @@ use splat::{
     },
     tracking::{TrackField, Tracker, TrackingSettings},
 };
-use tokio_util::sync::CancellationToken;
 
-use super::{print_json, track::progress};
+use super::{compute, print_json, track::progress};
 use crate::{
     error::CliError,
     logs::LogArgs,
@@ -85,43 +84,42 @@ struct Mean {
     mean: Option<f64>,
 }
 
-pub(super) fn run(
-    args: &EvalTracksArgs,
-    logs: &LogArgs,
-    interrupted: CancellationToken,
-) -> Result<(), CliError> {
+pub(super) fn run(args: EvalTracksArgs, logs: &LogArgs) -> Result<(), CliError> {
     let settings = args.tracker.settings()?;
     let tracker = args.tracker.load(&settings)?;
-    let views = ChosenViews::open(&args.views, interrupted)?;
+    let views = ChosenViews::open(&args.views)?;
     if views.clip().frames()[0] != 1 {
         let why = format!("exact flow starts at frame 1, not at {}", views.clip().frames()[0]);
         return Err(CliError::bad_input("--frames", format!("{why}; begin with frame 1")));
     }
-    let files = match args.tracks.as_slice() {
+    let files: Option<Vec<PathBuf>> = match args.tracks.as_slice() {
         [] => None,
-        files => Some(views.files(files)?),
+        files => Some(views.files(files)?.into_iter().cloned().collect()),
     };
     let points = views.clip().root().join(POINTS);
     let points = points.exists().then(|| PointTracks::read(&points)).transpose();
     let points = points.map_err(|error| CliError::BadInput(error.to_string()))?;
     let bar = progress(logs, (views.clip().frames().len() - 1) * views.positions.len());
-    let measure = |rank: usize| {
-        let source = match &files {
-            Some(files) => TrackSource::File(files[rank]),
-            None => TrackSource::Tracker(&tracker, &settings),
+    compute(move |interrupted| {
+        let views = views.until(interrupted);
+        let measure = |rank: usize| {
+            let source = match &files {
+                Some(files) => TrackSource::File(&files[rank]),
+                None => TrackSource::Tracker(&tracker, &settings),
+            };
+            let position = views.positions[rank];
+            ViewScores::measure(&views, position, source, points.as_ref(), args.pictures.as_deref(), &bar)
         };
-        let position = views.positions[rank];
-        ViewScores::measure(&views, position, source, points.as_ref(), args.pictures.as_deref(), &bar)
-    };
-    let ranks = 0..views.positions.len();
-    let measured: Vec<ViewScores> = ranks.into_par_iter().map(measure).collect::<Result<_, _>>()?;
-    bar.finish_and_clear();
-    let report = Report::new(&views, points.is_some(), &measured);
-    if args.json {
-        return print_json(&report);
-    }
-    report.print();
-    Ok(())
+        let ranks = 0..views.positions.len();
+        let measured: Vec<ViewScores> = ranks.into_par_iter().map(measure).collect::<Result<_, _>>()?;
+        bar.finish_and_clear();
+        let report = Report::new(&views, points.is_some(), &measured);
+        if args.json {
+            return print_json(&report);
+        }
+        report.print();
+        Ok(())
+    })
 }
 
 /// Where the tracks of a view come from.

@@ -87,8 +87,8 @@ pub(crate) fn run(cli: Cli) -> Result<(), CliError> {
     match command {
         Command::Eval(args) => eval::run(args),
         Command::Render(args) => render::run(args),
-        Command::Track(args) => compute(move |interrupted| track::run(&args, &logs, interrupted)),
-        Command::EvalTracks(args) => compute(move |interrupted| eval_tracks::run(&args, &logs, interrupted)),
+        Command::Track(args) => track::run(args, &logs),
+        Command::EvalTracks(args) => eval_tracks::run(args, &logs),
         Command::Inspect(args) => inspect::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Reconstruct(args) => wait(reconstruct::run(args, &logs)),

@@ -11,8 +11,8 @@ use splat::{
     image::Image,
     tracking::{TrackField, Tracker, TrackingSettings},
 };
-use tokio_util::sync::CancellationToken;
 
+use super::compute;
 use crate::{
     error::CliError,
     logs::LogArgs,
@@ -30,7 +30,8 @@ pub(crate) struct TrackArgs {
     #[command(flatten)]
     tracker: TrackerArgs,
 
-    /// Where the tracks go: a file ending in .npz for one view, else a folder, which gets <view>.npz of each.
+    /// Where the tracks go: a file ending in .npz for one view, else a folder, which gets <view>.npz of each, with _ for
+    /// each / of its name.
     ///
     /// `reconstruct --tracks` reads them, given all of them.
     #[arg(short, long, value_name = "FILE|DIR", help_heading = "Output")]
@@ -42,24 +43,27 @@ pub(crate) struct TrackArgs {
     pictures: Option<PathBuf>,
 }
 
-pub(super) fn run(args: &TrackArgs, logs: &LogArgs, interrupted: CancellationToken) -> Result<(), CliError> {
+pub(super) fn run(args: TrackArgs, logs: &LogArgs) -> Result<(), CliError> {
     let settings = args.tracker.settings()?;
     let tracker = args.tracker.load(&settings)?;
-    let views = ChosenViews::open(&args.views, interrupted)?;
+    let views = ChosenViews::open(&args.views)?;
     let files = files(&args.out, &views)?;
     let later_frames = views.clip().frames().len() - 1;
     let bar = progress(logs, later_frames * views.positions.len());
-    let track = |(&position, file): (&usize, &PathBuf)| {
-        let pictures = args.pictures.as_deref();
-        let run = ViewRun { views: &views, position, tracker: &tracker, settings: &settings, pictures };
-        run.write(file, &bar)
-    };
-    views.positions.par_iter().zip(&files).try_for_each(track)?;
-    bar.finish_and_clear();
-    files.iter().for_each(|file| {
-        stdout::line(file.display());
-    });
-    Ok(())
+    compute(move |interrupted| {
+        let views = views.until(interrupted);
+        let track = |(&position, file): (&usize, &PathBuf)| {
+            let pictures = args.pictures.as_deref();
+            let run = ViewRun { views: &views, position, tracker: &tracker, settings: &settings, pictures };
+            run.write(file, &bar)
+        };
+        views.positions.par_iter().zip(&files).try_for_each(track)?;
+        bar.finish_and_clear();
+        files.iter().for_each(|file| {
+            stdout::line(file.display());
+        });
+        Ok(())
+    })
 }
 
 /// A bar on a terminal; nothing elsewhere.

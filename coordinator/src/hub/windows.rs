@@ -81,7 +81,7 @@ impl Hub {
         let why = "the tracker's state is gone from the store, or damaged; tracks before it are made again";
         tracing::warn!(job_id = %job, position, attempt = lease.attempt, reason = reason.message, "{why}");
         // Whoever else names a damaged blob has no use for it. The file goes before its row: of a row without a file the
-        // next lease takes notice, while a damaged file that nothing names is taken for one that is there already.
+        // next lease takes notice.
         self.blobs.remove(&blob).await;
         let mut change = self.store.change().await?;
         change.remove_artifact(&key).await?;

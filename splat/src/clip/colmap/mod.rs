@@ -5,7 +5,7 @@ mod text;
 
 use std::{
     collections::BTreeMap,
-    path::{Path, PathBuf},
+    path::{Component, Path, PathBuf},
 };
 
 use super::{
@@ -132,12 +132,13 @@ fn views_of(
             return Err(ClipError::malformed(&files.images, "image name", &image.name, expected));
         }
         let frame = frame_number(&path).ok_or_else(|| ClipError::UnnumberedFrame { path: path.clone() })?;
-        sighting(files, model, image, split, folder, frame, path)
+        let looked_for = path.parent().unwrap_or(&image_root).to_owned();
+        let found = sighting(files, model, image, split, folder, frame, path)?;
+        Ok(FoundView { looked_for, ..found })
     };
     let sightings = model.images.iter().map(in_folder).collect::<Result<Vec<_>, _>>()?;
     let mut views = merge_frames(sightings)?;
     for view in &mut views {
-        view.looked_for = image_root.join(&view.name);
         view.images.extend(numbered_images(&view.looked_for)?);
     }
     Ok(views)
@@ -198,9 +199,14 @@ fn lens_error(files: &ModelFiles, id: u32, stated: &ModelCamera, problem: LensPr
     }
 }
 
-/// The folder part of an image name, empty if there is none.
+/// The folder part of an image name, without what leads nowhere (`./`, a leading or a second `/`); empty if there is none.
 fn folder_of(name: &str) -> String {
-    Path::new(name).parent().unwrap_or(Path::new("")).to_string_lossy().into_owned()
+    let parts =
+        Path::new(name).parent().into_iter().flat_map(Path::components).filter_map(|part| match part {
+            Component::Normal(_) | Component::ParentDir => Some(part.as_os_str().to_string_lossy()),
+            _ => None,
+        });
+    parts.collect::<Vec<_>>().join("/")
 }
 
 #[cfg(test)]

@@ -316,6 +316,32 @@ fn cameras_may_be_registered_in_several_frames_if_they_stand_still() {
 }
 
 #[test]
+fn folders_of_images_are_names_whatever_way_leads_to_them() {
+    for (name, folder) in [
+        ("./cam0/1.png", "cam0"),
+        ("rig//left/./cam0/1.png", "rig/left/cam0"),
+        ("/data/cam0/1.png", "data/cam0"),
+        ("./1.png", ""),
+        // Such a name is refused.
+        ("../cam0/1.png", "../cam0"),
+    ] {
+        assert_eq!(folder_of(name), folder);
+    }
+    let clip = colmap();
+    let here = format!("{}/images/cam02/frame", clip.root().display());
+    for (from, to) in [(" cam01/frame", " .//cam01/frame"), (" cam02/frame", &format!(" {here}"))] {
+        clip.edit("sparse/0/images.txt", from, to);
+    }
+    let opened = clip.open().unwrap();
+    assert_eq!(opened.frames(), [1, 2, 3]);
+    let names: Vec<String> = opened.views().iter().map(|view| view.name.clone()).collect();
+    assert!(names.contains(&"cam01".to_owned()), "{names:?}");
+    assert!(names.iter().any(|name| name.ends_with("images/cam02")), "{names:?}");
+    let moved = names.iter().position(|name| name.ends_with("cam02")).unwrap();
+    assert_eq!(*opened.image(moved, 2).unwrap(), clip.image(2, 3));
+}
+
+#[test]
 fn flat_images_are_views_of_one_frame() {
     let clip = colmap();
     for (index, view) in clip.views.iter().enumerate() {
